@@ -1,0 +1,42 @@
+"""What the particle filter leaves behind when the robot leaves a vertex: a grid, the scans it was made of, a cloud."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from frontend.records import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """An occupancy grid in some frame.
+
+    Attributes:
+        log_odds: (height, width) float32, row = y, column = x; 0 where nothing is known, positive where occupied.
+        resolution: metres per cell.
+        origin: (2,) coordinates, in the grid's frame, of the outer corner of cell [0, 0].
+    """
+
+    log_odds: npt.NDArray[np.float32]
+    resolution: float
+    origin: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class LocalMap:
+    """The metric map of one vertex, in the vertex's ``local`` frame.
+
+    Attributes:
+        grid: log-odds occupancy grid of the best particle.
+        scans: (n,) indices of the scans taken in this vertex, into the robot's log, ascending.
+        times: (n,) their times, seconds.
+        poses: (n, 3) local_T_robot at each of them.
+        cloud: (m, 2) centres of the occupied cells, metres.
+    """
+
+    grid: Grid
+    scans: npt.NDArray[np.int64]
+    times: FloatArray
+    poses: FloatArray
+    cloud: FloatArray
