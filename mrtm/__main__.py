@@ -1,0 +1,5 @@
+"""``python -m mrtm``."""
+
+from mrtm.cli import main
+
+main()
