@@ -1,0 +1,99 @@
+"""Robot logs as laser scans.
+
+``open_log(path)`` recognises compression and format by content. A format is a module of this package with a ``NAME``,
+``sniff(first_lines) -> bool`` and ``read(numbered_lines, report) -> Iterator[LaserScan]``; adding one adds the format.
+"""
+
+import pkgutil
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Protocol, cast
+
+from frontend.errors import LogError
+from frontend.readers.lines import read_blocks, split_lines
+from frontend.readers.report import Report
+from frontend.records import LaserScan
+
+__all__ = ["Log", "Report", "open_log"]
+
+
+class _Format(Protocol):
+    NAME: str
+
+    def sniff(self, lines: list[bytes]) -> bool: ...
+
+    def read(self, lines: Iterator[tuple[int, bytes]], report: Report) -> Iterator[LaserScan]: ...
+
+
+@dataclass(slots=True)
+class Log:
+    """A robot's log.
+
+    Attributes:
+        path: the file.
+        format: the format's name, for example "CARMEN".
+        report: what the latest pass of ``scans`` has met so far.
+    """
+
+    path: Path
+    format: str
+    _reader: _Format = field(repr=False)
+    report: Report = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.report = Report(self.path)
+
+    def scans(self) -> Iterator[LaserScan]:
+        """Yield the scans in file order, in memory that does not grow with the log; each call reads it anew.
+
+        Raises:
+            LogError: the file cannot be read, has no usable scan, or its number of beams changes.
+        """
+        report = self.report = Report(self.path)
+        lines = split_lines(read_blocks(self.path, report), report)
+        yield from self._reader.read(lines, report)
+        if not report.scans:
+            raise LogError(f"{self.path}: no usable scan{_why(report)}")
+
+
+def open_log(path: Path) -> Log:
+    """Recognise a log by its content; its scans are read later, by ``scans()``.
+
+    Raises:
+        LogError: the file is missing, empty, unreadable, or of no known format.
+    """
+    if path.is_dir():
+        raise LogError(f"{path}: is a directory, not a log")
+    if not path.exists():
+        raise LogError(f"{path}: no such file")
+    report = Report(path)
+    blocks = read_blocks(path, report)
+    head = next(blocks, b"")
+    if not head:
+        raise LogError(f"{path}: {report.damage or 'is empty'}")
+    lines = head.split(b"\n")
+    formats = _formats()
+    for reader in formats:
+        if reader.sniff(lines):
+            return Log(path, reader.NAME, reader)
+    known = ", ".join(reader.NAME for reader in formats)
+    raise LogError(f"{path}: not a log of a known format ({known}, plain or compressed with gzip, bzip2 or xz)")
+
+
+@cache
+def _formats() -> tuple[_Format, ...]:
+    modules = [import_module(f"{__name__}.{module.name}") for module in pkgutil.iter_modules(__path__)]
+    return tuple(cast(_Format, module) for module in modules if hasattr(module, "sniff"))
+
+
+def _why(report: Report) -> str:
+    if report.damage:
+        return f"; {report.damage}"
+    if report.skipped_examples:
+        line, reason = report.skipped_examples[0]
+        return f"; line {line}: {reason}"
+    found = ", ".join(f"{count} {name}" for name, count in sorted(report.lines.items()))
+    return f" among its lines ({found})" if found else ""
