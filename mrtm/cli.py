@@ -1,0 +1,132 @@
+"""The command ``mrtm``: parse, call, print. Everything heavy is imported by the command that needs it."""
+
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from frontend.errors import FrontendError
+from mrtm import __version__
+from mrtm.errors import MrtmError
+
+if TYPE_CHECKING:
+    from mrtm.config import Config
+    from mrtm.evaluation import Evaluation, Statistics
+
+app = typer.Typer(
+    name="mrtm",
+    help="Joint 2D laser maps from a team of robots.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE", help="YAML; `mrtm config` prints one.")]
+Options = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="One parameter, e.g. frontend.particles=60. Repeatable."),
+]
+Preset = Annotated[str | None, typer.Option(metavar="NAME", help='"paper": the values of the paper.')]
+
+
+@app.callback(invoke_without_command=True)
+def _main(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        typer.echo(f"mrtm {__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def run(
+    log: Annotated[Path, typer.Argument(help="A robot's log; the format is found by its content.")],
+    out: Annotated[Path, typer.Option(help="Directory for map, trajectory and graph.")],
+    config: ConfigFile = None,
+    options: Options = None,
+    preset: Preset = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers; as --set seed=N.")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads; all cores if not given.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+) -> None:
+    """Map a building from a log."""
+    parameters = _load(config, preset, [*(options or ()), *([] if seed is None else [f"seed={seed}"])])
+    if threads is not None:
+        os.environ["NUMBA_NUM_THREADS"] = str(threads)  # numba reads it when it is imported, below
+    from mrtm.progress import showing
+    from mrtm.session import run_log
+
+    with showing(quiet) as progress:
+        run_log(log, out, parameters, progress)
+
+
+@app.command()
+def evaluate(
+    out: Annotated[Path, typer.Argument(help="What `mrtm run` left behind.")],
+    relations: Annotated[Path | None, typer.Option(metavar="FILE", help="True relative poses.")] = None,
+    truth: Annotated[Path | None, typer.Option(metavar="TUM", help="True or reference trajectory.")] = None,
+) -> None:
+    """Measure a run against the truth."""
+    if relations is None and truth is None:
+        raise typer.BadParameter("give --relations FILE, --truth TUM, or both")
+    from mrtm.evaluation import evaluate_output
+
+    for line in _summary(evaluate_output(out, relations, truth)):
+        typer.echo(line)
+
+
+@app.command("config")
+def show_config(config: ConfigFile = None, options: Options = None, preset: Preset = None) -> None:
+    """Print every parameter with its unit, meaning and the paper's value; the output is a file for --config."""
+    from mrtm.config import to_yaml
+
+    typer.echo(to_yaml(_load(config, preset, options or [])), nl=False)
+
+
+def _summary(evaluation: "Evaluation") -> Iterator[str]:
+    """One line a measure: mean, deviation and what was left out."""
+    for name, errors in (("relations", evaluation.relations), ("between robots", evaluation.relations_across)):
+        if errors is not None and errors.count + errors.no_scan + errors.unconnected:
+            yield (
+                f"{name}: {_spread(errors.translation)} m, {_spread(errors.rotation)} deg over {errors.count}; "
+                f"left out: {errors.no_scan} without a scan near, {errors.unconnected} never joined"
+            )
+    for absolute in evaluation.ate:
+        yield (
+            f"ATE of {', '.join(absolute.robots)}: RMSE {absolute.translation.rmse:.4f} m, "
+            f"{absolute.rotation.rmse:.3f} deg over {absolute.count}; left out: {absolute.no_scan} without a scan near"
+        )
+    honesty = {"vertices": evaluation.vertices, **(evaluation.edges or {})}
+    for name, measured in honesty.items():
+        if measured is not None and measured.count:
+            yield f"NEES of {name}: {measured.nees.mean:.2f} over {measured.count}"
+
+
+def _spread(errors: "Statistics") -> str:
+    return f"{errors.mean:.4f} ± {errors.std:.4f} (median {errors.median:.4f})"
+
+
+def _load(file: Path | None, preset: str | None, options: Sequence[str]) -> "Config":
+    from mrtm.config import load_config
+
+    return load_config(file, preset, options)
+
+
+def main() -> None:
+    """Run the command line; an error that is the user's to mend is one line on stderr and exit code 2."""
+    try:
+        app()
+    except (MrtmError, FrontendError) as error:
+        _fail(str(error))
+    except OSError as error:
+        if error.filename is None:
+            raise
+        _fail(f"{error.filename}: {error.strerror}")
+
+
+def _fail(message: str) -> None:
+    line = " ".join(message.split())  # a hostile file name must not break the line
+    typer.secho(f"error: {line}", fg="red", err=True)
+    sys.exit(2)
