@@ -1,0 +1,118 @@
+"""Edges of the topological map: plain immutable data, valid by construction."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from factors.errors import FactorError
+from factors.noise import FloatArray, UncertainPose, check_covariance, check_pose
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class VertexId:
+    """A vertex: the robot that made it and its running number, from 0. Reads "red:3"."""
+
+    robot: str
+    index: int
+
+    def __str__(self) -> str:
+        return f"{self.robot}:{self.index}"
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class EdgeId:
+    """An edge: the robot that made it and its running number, from 0. Reads "red#7"."""
+
+    robot: str
+    number: int
+
+    def __str__(self) -> str:
+        return f"{self.robot}#{self.number}"
+
+
+class EdgeKind(StrEnum):
+    """What an edge came from; the kind decides the factor it becomes."""
+
+    INTER_VERTEX = "inter_vertex"  # M7b
+    COVARIANCE_INTERSECTION = "covariance_intersection"  # M5
+    LOOP = "loop"  # M8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edge:
+    """One version of a measured transform between two vertices; a change is a new Edge with a higher version.
+
+    Attributes:
+        id: same for all versions.
+        version: from 0.
+        kind: may change between versions (M5 turns an inter-vertex edge into a covariance intersection).
+        tail, head: the two vertices.
+        measurement: tail_T_head, metres and radians.
+        covariance: (3, 3) in the tangent frame of ``head``; kept as a read-only copy.
+
+    Raises:
+        FactorError: if the measurement is not finite, the covariance is refused by ``check_covariance``, or
+            tail and head are the same.
+    """
+
+    id: EdgeId
+    version: int
+    kind: EdgeKind
+    tail: VertexId
+    head: VertexId
+    measurement: gtsam.Pose2
+    covariance: FloatArray
+
+    def __post_init__(self) -> None:
+        if self.version < 0:
+            raise FactorError(f"edge {self.id}: version {self.version} is negative")
+        if self.tail == self.head:
+            raise FactorError(f"{self}: tail and head are the same vertex")
+        check_pose(self.measurement, str(self))
+        object.__setattr__(self, "covariance", check_covariance(self.covariance, str(self)))
+
+    def __str__(self) -> str:
+        return f"edge {self.id} version {self.version} ({self.kind} {self.tail} -> {self.head})"
+
+    @property
+    def estimate(self) -> UncertainPose:
+        """tail_T_head with its covariance in the frame of head."""
+        return UncertainPose(self.measurement, self.covariance)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and strings, fit for JSON; ``from_dict`` reads them back without loss."""
+        pose = self.measurement
+        return {
+            "id": [self.id.robot, self.id.number],
+            "version": self.version,
+            "kind": str(self.kind),
+            "tail": [self.tail.robot, self.tail.index],
+            "head": [self.head.robot, self.head.index],
+            "measurement": [pose.x(), pose.y(), pose.theta()],
+            "covariance": self.covariance.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "Edge":
+        """The edge that ``to_dict`` wrote.
+
+        Raises:
+            FactorError: if the data are not those of a valid edge.
+        """
+        try:
+            return cls(
+                id=EdgeId(*data["id"]),
+                version=data["version"],
+                kind=EdgeKind(data["kind"]),
+                tail=VertexId(*data["tail"]),
+                head=VertexId(*data["head"]),
+                measurement=gtsam.Pose2(*data["measurement"]),
+                covariance=np.array(data["covariance"], dtype=np.float64),
+            )
+        except FactorError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:
+            raise FactorError(f"not an edge: {error!r} in {data!r}") from error

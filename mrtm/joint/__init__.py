@@ -1,0 +1,1 @@
+"""The joint map: what all edges together say about all vertices."""
