@@ -1,0 +1,1 @@
+"""Tools for people working on the project; not installed."""
