@@ -389,6 +389,15 @@ def test_the_command_writes_log_truth_plan_and_picture(tmp_path: Path) -> None:
     assert (out / "square.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_failed_run_leaves_an_older_log_alone(tmp_path: Path) -> None:
+    write_plan(SQUARE, tmp_path / "square.json")
+    (tmp_path / "square.clf.gz").write_bytes(b"precious")
+    result = CliRunner().invoke(app, [str(tmp_path / "square.json"), "--route", "wall", "--out", str(tmp_path)])
+    assert result.exit_code == 1
+    assert "something is 0." in result.output
+    assert (tmp_path / "square.clf.gz").read_bytes() == b"precious"
+
+
 def test_the_command_says_what_is_wrong_in_one_line(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [str(tmp_path / "none.json"), "--out", str(tmp_path)])
     assert result.exit_code == 1

@@ -7,6 +7,7 @@ import lzma
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import IO, TextIO, cast
 
@@ -30,14 +31,13 @@ def write_carmen(log: SimulatedLog | Iterable[SimulatedLog], path: Path) -> None
         log: a log, or its pieces in order.
         path: compressed when it ends in .gz, .bz2 or .xz.
     """
-    parts = [log] if isinstance(log, SimulatedLog) else log
+    parts = iter([log] if isinstance(log, SimulatedLog) else log)
+    first = next(parts)  # if the route cannot be driven, an older file stays as it was
+    begin = float(first.times[0])
+    previous: SimulatedLog | None = None
     with _opened(path) as file:
-        previous: SimulatedLog | None = None
-        begin = 0.0
-        for part in parts:
-            if previous is None:
-                begin = float(part.times[0])
-                file.writelines(_header(part.laser))
+        file.writelines(_header(first.laser))
+        for part in chain([first], parts):
             _write_scans(file, part, begin, _speeds(part, previous))
             previous = part
 
