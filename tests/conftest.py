@@ -1,0 +1,18 @@
+"""What tests share: where the real logs are."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PLACES = (os.environ.get("MRTM_DATA", ""), ROOT.parent / "shared" / "data", ROOT / "data" / "cache")
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The directory of the real logs: $MRTM_DATA, ../shared/data or data/cache; without one the test is skipped."""
+    for place in PLACES:
+        if place and any(Path(place).glob("*.clf*")):
+            return Path(place)
+    pytest.skip("no real logs: set MRTM_DATA to their directory")

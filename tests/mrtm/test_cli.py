@@ -1,0 +1,74 @@
+"""The command line as a user meets it: a process, its output and its exit code."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mrtm
+from mrtm.config import load_config
+
+HEAVY = ("numpy", "scipy", "numba", "gtsam", "matplotlib", "pydantic.main", "yaml")
+
+
+def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "mrtm", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_version() -> None:
+    done = call("--version")
+    assert (done.returncode, done.stdout.strip()) == (0, f"mrtm {mrtm.__version__}")
+
+
+@pytest.mark.parametrize("command", [(), ("run",), ("evaluate",), ("config",)])
+def test_help(command: tuple[str, ...]) -> None:
+    done = call(*command, "--help")
+    assert done.returncode == 0
+    assert "Usage" in done.stdout
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = f"import sys, mrtm.cli; print([name for name in {HEAVY!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_config_prints_what_config_reads(tmp_path: Path) -> None:
+    done = call("config", "--preset", "paper", "--set", "frontend.particles=60", "--set", "seed=3")
+    assert done.returncode == 0
+    path = tmp_path / "printed.yaml"
+    path.write_text(done.stdout)
+    assert load_config(path) == load_config(preset="paper", options=["frontend.particles=60", "seed=3"])
+    assert call("config", "--config", path).stdout == done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("config", "--set", "frontend.particels=60"), "did you mean frontend.particles?"),
+        (("config", "--config", "missing.yaml"), "missing.yaml: cannot be read"),
+        (("config", "--preset", "papper"), "no such preset; there is: paper"),
+        (("run", "missing.clf", "--out", "OUT", "--quiet"), "missing.clf: no such file"),
+        (("run", "missing.clf", "--out", "OUT", "--seed", "-1"), "seed is -1: must be at least 0"),
+        (("run", "EMPTY", "--out", "OUT", "--quiet"), "is empty"),
+        (("evaluate", "OUT", "--relations", "missing.relations"), "OUT"),
+    ],
+)
+def test_a_user_error_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
+    places = {"OUT": str(tmp_path / "OUT"), "EMPTY": str(tmp_path / "empty.clf")}
+    (tmp_path / "empty.clf").touch()
+    done = call(*(places.get(argument, argument) for argument in arguments))
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert done.stderr.startswith("error: ")
+    assert said in done.stderr
+
+
+def test_a_wrong_use_is_exit_code_2() -> None:
+    assert call("run").returncode == 2
+    done = call("evaluate", "somewhere")
+    assert done.returncode == 2
+    assert "--relations" in done.stderr
