@@ -83,7 +83,7 @@ class Edge:
         return UncertainPose(self.measurement, self.covariance)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and strings, fit for JSON; ``from_dict`` reads them back without loss."""
+        """Plain numbers and strings, fit for JSON; ``from_dict`` reads them back, the angle to one part in 1e15."""
         pose = self.measurement
         return {
             "id": [self.id.robot, self.id.number],

@@ -191,14 +191,17 @@ class JointGraph:
         return graph
 
     def write_g2o(self, path: Path) -> None:
-        """The graph and its estimate for g2o and GTSAM: vertices numbered in the order they came, no kernels."""
+        """The graph and its estimate for g2o and GTSAM: vertices numbered in the order they came, no kernels.
+
+        Written here, not by ``gtsam.writeG2o``, which keeps six digits and refuses robust factors.
+        """
         numbers = {vertex: number for number, vertex in enumerate(self._keys)}
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for edge in self._edges.values():
-            graph.push_back(without_kernel(factor_of(edge, numbers[edge.tail], numbers[edge.head])))
-        for vertex, pose in self.estimates().items():
-            values.insert(numbers[vertex], pose)
-        gtsam.writeG2o(graph, values, str(path))
+        lines = [("VERTEX_SE2", numbers[v], *_coordinates(pose)) for v, pose in self.estimates().items()]
+        upper = np.triu_indices(3)
+        for e in self._edges.values():
+            information = np.linalg.inv(e.covariance)[upper].tolist()
+            lines.append(("EDGE_SE2", numbers[e.tail], numbers[e.head], *_coordinates(e.measurement), *information))
+        path.write_text("".join(" ".join(map(str, line)) + "\n" for line in lines), encoding="ascii")
 
     def _apply(self, added: list[Edge], replaced: list[Edge], removed: set[EdgeId], gone: set[VertexId]) -> None:
         """Stage the change, check it, and solve it in at most three iSAM2 updates, mostly one."""
@@ -298,7 +301,7 @@ class JointGraph:
         return self._keys[vertex]
 
     def _factor(self, edge: Edge) -> gtsam.BetweenFactorPose2:
-        return factor_of(edge, self._keys[edge.tail], self._keys[edge.head])
+        return factor_of(edge, self._key(edge.tail), self._key(edge.head))
 
 
 def _coordinates(pose: gtsam.Pose2) -> list[float]:

@@ -16,9 +16,9 @@ from factors import EdgeId
 
 FloatArray = npt.NDArray[np.float64]
 
-# Metres or radians below which a variable counts as settled: the estimate is within about 1e-5 of the optimum.
-_RELINEARIZE_THRESHOLD = 1e-5
-_WILDFIRE_THRESHOLD = 1e-6
+# Metres or radians below which a variable counts as settled: the estimate is within about 2e-5 of the optimum.
+_RELINEARIZE_THRESHOLD = 1e-4
+_WILDFIRE_THRESHOLD = 1e-5
 _MAX_STEPS = 30
 
 # Standard deviation that stands for "this pose is the reference": nothing against any measurement.

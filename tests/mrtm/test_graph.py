@@ -1,0 +1,444 @@
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import (
+    Edge,
+    EdgeId,
+    EdgeKind,
+    FactorError,
+    VertexId,
+    compose,
+    factor_of,
+    inverse,
+    prior_factor,
+    without_kernel,
+)
+from mrtm.joint import smoother
+from mrtm.joint.graph import GraphError, JointGraph
+
+STEP_COVARIANCE = np.diag([0.03, 0.02, np.radians(0.3)]) ** 2
+LOOP_COVARIANCE = np.diag([0.02, 0.02, np.radians(0.2)]) ** 2
+
+
+def vertex(index: int) -> VertexId:
+    return VertexId("red", index)
+
+
+class World:
+    """A random walk among vertices with known poses, and edges with honest noise between any two of them."""
+
+    def __init__(self, seed: int, count: int, turn: float = 0.9) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.truth = [gtsam.Pose2()]
+        while len(self.truth) < count:
+            step = gtsam.Pose2(*self.rng.uniform([4.0, -1.0, -turn], [8.0, 1.0, turn]))
+            self.truth.append(self.truth[-1].compose(step))
+
+    def edge(
+        self,
+        number: int,
+        tail: int,
+        head: int,
+        kind: EdgeKind = EdgeKind.INTER_VERTEX,
+        version: int = 0,
+        off: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> Edge:
+        covariance = LOOP_COVARIANCE if kind is EdgeKind.LOOP else STEP_COVARIANCE
+        noise = gtsam.Pose2.Expmap(self.rng.multivariate_normal(np.zeros(3), covariance))
+        measured = self.truth[tail].between(self.truth[head]).compose(noise).compose(gtsam.Pose2(*off))
+        return Edge(EdgeId("red", number), version, kind, vertex(tail), vertex(head), measured, covariance)
+
+    def chain(self) -> list[Edge]:
+        return [self.edge(i, i, i + 1) for i in range(len(self.truth) - 1)]
+
+
+def batch_optimum(graph: JointGraph, start: dict[VertexId, gtsam.Pose2]) -> dict[VertexId, gtsam.Pose2]:
+    """Levenberg-Marquardt over the edges the graph says it has, from elsewhere."""
+    keys = {v: i for i, v in enumerate(graph.vertices())}
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    factors.push_back(prior_factor(keys[graph.root], gtsam.Pose2()))
+    for edge in graph.edges():
+        factors.push_back(factor_of(edge, keys[edge.tail], keys[edge.head]))
+    for v, key in keys.items():
+        values.insert(key, start[v])
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-15)
+    params.setAbsoluteErrorTol(1e-15)
+    params.setMaxIterations(200)
+    result = gtsam.LevenbergMarquardtOptimizer(factors, values, params).optimize()
+    return {v: result.atPose2(key) for v, key in keys.items()}
+
+
+def distance(a: dict[VertexId, gtsam.Pose2], b: dict[VertexId, gtsam.Pose2]) -> float:
+    assert a.keys() == b.keys()
+    return max(float(np.abs(gtsam.Pose2.Logmap(a[v].between(b[v]))).max()) for v in a)
+
+
+def built(edges: Iterable[Edge]) -> JointGraph:
+    graph = JointGraph(vertex(0))
+    graph.update(add=edges)
+    return graph
+
+
+def dense_covariance(graph: JointGraph) -> np.ndarray:
+    """The joint covariance of all vertices by inverting the whole information matrix, kernels off."""
+    keys = {v: i for i, v in enumerate(graph.vertices())}
+    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    factors.push_back(prior_factor(0, gtsam.Pose2()))
+    for edge in graph.edges():
+        factors.push_back(without_kernel(factor_of(edge, keys[edge.tail], keys[edge.head])))
+    for v, pose in graph.estimates().items():
+        values.insert(keys[v], pose)
+    information, _ = factors.linearize(values).hessian()
+    return np.linalg.inv(information)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_estimate_is_the_batch_optimum_after_every_change(seed: int) -> None:
+    world = World(seed, 25)
+    truth = {vertex(i): pose for i, pose in enumerate(world.truth)}
+    graph = JointGraph(vertex(0))
+
+    def check() -> None:
+        start = {v: truth[v] for v in graph.vertices()}
+        assert distance(graph.estimates(), batch_optimum(graph, start)) < 1e-4
+
+    number = 100
+    for edge in world.chain():
+        graph.update(add=[edge])
+        last = edge.head.index
+        if last > 3 and world.rng.random() < 0.5:
+            back = int(world.rng.integers(0, last - 1))
+            graph.update(add=[world.edge(number, last, back, EdgeKind.LOOP)])
+            number += 1
+        check()
+    for edge_id in world.rng.permutation(24)[:6]:
+        old = next(e for e in graph.edges() if e.id == EdgeId("red", int(edge_id)))
+        kind = EdgeKind.COVARIANCE_INTERSECTION
+        graph.update(replace=[world.edge(old.id.number, old.tail.index, old.head.index, kind, version=1)])
+        check()
+    for edge in [e for e in graph.edges() if e.kind is EdgeKind.LOOP]:
+        graph.update(remove=[edge.id])
+        check()
+
+
+def test_one_update_or_many_come_to_the_same() -> None:
+    world = World(5, 15)
+    edges = [*world.chain(), world.edge(50, 14, 2, EdgeKind.LOOP), world.edge(51, 9, 0, EdgeKind.LOOP)]
+    one_by_one = JointGraph(vertex(0))
+    for edge in edges:
+        one_by_one.update(add=[edge])
+    assert distance(built(edges).estimates(), one_by_one.estimates()) < 1e-4
+    assert distance(built(reversed(edges)).estimates(), one_by_one.estimates()) < 1e-4
+
+
+def test_replace_and_remove_leave_no_trace() -> None:
+    world = World(6, 12)
+    chain, loop = world.chain(), world.edge(50, 11, 1, EdgeKind.LOOP)
+    newer = world.edge(4, 4, 5, EdgeKind.COVARIANCE_INTERSECTION, version=3)
+    graph = built([*chain, loop])
+    graph.update(replace=[newer])
+    assert distance(graph.estimates(), built([*chain[:4], newer, *chain[5:], loop]).estimates()) < 1e-4
+    graph.update(remove=[loop.id])
+    plain = built([*chain[:4], newer, *chain[5:]])
+    assert distance(graph.estimates(), plain.estimates()) < 1e-4
+    np.testing.assert_allclose(graph.marginal(vertex(11)), plain.marginal(vertex(11)), rtol=1e-3, atol=1e-9)
+
+
+def test_a_vertex_goes_with_its_edges_and_may_come_back() -> None:
+    world = World(7, 8)
+    chain = world.chain()
+    graph = built(chain)
+    graph.update(add=[world.edge(50, 7, 3, EdgeKind.LOOP)])
+    graph.update(remove_vertices=[vertex(7)])
+    assert graph.vertices() == [vertex(i) for i in range(7)]
+    assert [e.id for e in graph.edges()] == [e.id for e in chain[:6]]
+    assert distance(graph.estimates(), built(chain[:6]).estimates()) < 1e-6
+    graph.update(add=[chain[6]])
+    assert distance(graph.estimates(), built(chain).estimates()) < 1e-6
+
+
+def test_undo_and_redo_in_one_update() -> None:
+    """A re-entry undone: vertex and loop go, the new vertex comes, all at once."""
+    world = World(8, 8)
+    chain = world.chain()
+    graph = built([*chain, world.edge(50, 5, 1, EdgeKind.LOOP)])
+    again = world.edge(60, 5, 7)
+    graph.update(remove=[EdgeId("red", 50)], remove_vertices=[vertex(7)], add=[again])
+    assert distance(graph.estimates(), built([*chain[:6], again]).estimates()) < 1e-6
+
+
+def test_edge_may_point_either_way() -> None:
+    world = World(9, 3)
+    graph = built([world.edge(0, 1, 0), world.edge(1, 2, 1)])
+    expected = graph.estimate(vertex(1)).between(graph.estimate(vertex(0)))
+    assert expected.equals(graph.edges()[0].measurement, 1e-6)
+
+
+@pytest.fixture
+def looped() -> tuple[World, JointGraph]:
+    world = World(11, 10)
+    return world, built([*world.chain(), world.edge(50, 9, 4, EdgeKind.LOOP), world.edge(51, 6, 0, EdgeKind.LOOP)])
+
+
+def test_refusals_name_the_fault_and_change_nothing(looped: tuple[World, JointGraph]) -> None:
+    world, graph = looped
+    before, edges, vertices = graph.estimates(), graph.edges(), graph.vertices()
+    stray = Edge(
+        EdgeId("blue", 1),
+        0,
+        EdgeKind.INTER_VERTEX,
+        VertexId("blue", 0),
+        VertexId("blue", 1),
+        gtsam.Pose2(),
+        STEP_COVARIANCE,
+    )
+    new = world.edge(70, 9, 5, EdgeKind.LOOP)
+    faults: list[tuple[dict[str, Any], str]] = [
+        ({"add": [new, world.edge(3, 3, 4)]}, r"edge red#3 .* already in the joint graph, at version 0"),
+        ({"add": [new, stray]}, r"edge blue#1 .* neither end is connected to root red:0"),
+        ({"add": [new], "replace": [world.edge(99, 3, 4, version=1)]}, "edge red#99 is not in"),
+        ({"add": [new], "replace": [world.edge(3, 3, 4, version=0)]}, "cannot replace version 0"),
+        ({"add": [new], "replace": [world.edge(3, 3, 5, version=1)]}, "joins other vertices"),
+        ({"add": [new], "remove": [EdgeId("red", 98)]}, "edge red#98 cannot be removed"),
+        ({"add": [new], "remove": [EdgeId("red", 3), EdgeId("red", 51)]}, r"vertices red:4, .*red:9 would be cut off"),
+        ({"add": [new], "remove_vertices": [vertex(0)]}, "red:0 is the root"),
+        ({"add": [new], "remove_vertices": [vertex(42)]}, "red:42 is not in"),
+    ]
+    for change, message in faults:
+        with pytest.raises(GraphError, match=message):
+            graph.update(**change)
+        assert graph.edges() == edges
+        assert graph.vertices() == vertices
+        assert distance(graph.estimates(), before) == 0.0
+    for ask in (graph.estimate, graph.marginal):
+        with pytest.raises(GraphError, match="red:42 is not in"):
+            ask(vertex(42))
+    with pytest.raises(GraphError, match="red#98 is not in"):
+        graph.chi2(EdgeId("red", 98))
+    with pytest.raises(FactorError, match="root red:0: pose is not finite"):
+        JointGraph(vertex(0), gtsam.Pose2(np.nan, 0.0, 0.0))
+    graph.update(add=[new])
+    assert new in graph.edges()
+
+
+def test_survives_a_solver_that_gives_up(looped: tuple[World, JointGraph], monkeypatch: pytest.MonkeyPatch) -> None:
+    world, graph = looped
+    before = graph.estimates()
+
+    def give_up(*_: object) -> None:
+        raise RuntimeError("Indeterminate linear system")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(smoother.Smoother, "update", give_up)
+        with pytest.raises(GraphError, match="cannot be solved with this change"):
+            graph.update(add=[world.edge(70, 9, 5, EdgeKind.LOOP)])
+    assert distance(graph.estimates(), before) < 1e-6
+    graph.update(add=[world.edge(70, 9, 5, EdgeKind.LOOP)])
+    assert distance(graph.estimates(), batch_optimum(graph, graph.estimates())) < 1e-4
+
+
+def test_levenberg_marquardt_takes_over_where_gauss_newton_does_not_settle(
+    looped: tuple[World, JointGraph], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, graph = looped
+    monkeypatch.setattr(smoother, "_MAX_STEPS", 0)
+    again = built(graph.edges())
+    assert distance(again.estimates(), graph.estimates()) < 1e-4
+
+
+def test_solves_covariances_of_very_different_size() -> None:
+    """Corridors: millimetres across, metres along. GTSAM's Cholesky calls such graphs indeterminate."""
+    world = World(12, 30)
+    covariance = np.diag([4.0, 1e-6, 1e-8])
+    edges = []
+    for edge in [*world.chain(), world.edge(50, 29, 0), world.edge(51, 15, 3)]:
+        edges.append(Edge(edge.id, 0, edge.kind, edge.tail, edge.head, edge.measurement, covariance))
+    graph = JointGraph(vertex(0))
+    for edge in edges:
+        graph.update(add=[edge])
+    assert np.all(np.isfinite(graph.marginal(vertex(20))))
+
+
+def test_marginal_is_that_of_the_dense_inverse(looped: tuple[World, JointGraph]) -> None:
+    _, graph = looped
+    dense = dense_covariance(graph)
+    for i in range(10):
+        block = dense[3 * i : 3 * i + 3, 3 * i : 3 * i + 3]
+        np.testing.assert_allclose(graph.marginal(vertex(i)), block, rtol=1e-3, atol=1e-10)
+
+
+def test_relative_is_that_of_the_dense_inverse(looped: tuple[World, JointGraph]) -> None:
+    _, graph = looped
+    dense = dense_covariance(graph)
+    for a, b in ((0, 9), (9, 0), (3, 7), (8, 2), (5, 5)):
+        pose, covariance = graph.relative(vertex(a), vertex(b))
+        assert pose.equals(graph.estimate(vertex(a)).between(graph.estimate(vertex(b))), 1e-9)
+        # a Exp(x), b Exp(y): a_T_b Exp(-Ad(b_T_a) x + y) to first order.
+        by = np.zeros((3, dense.shape[0]))
+        by[:, 3 * a : 3 * a + 3] -= pose.inverse().AdjointMap()
+        by[:, 3 * b : 3 * b + 3] += np.eye(3)
+        np.testing.assert_allclose(covariance, by @ dense @ by.T, rtol=1e-3, atol=1e-9)
+
+
+def test_relative_along_a_chain_is_the_composition() -> None:
+    world = World(13, 6)
+    chain = world.chain()
+    graph = built(chain)
+    along = chain[2].estimate
+    for edge in chain[3:]:
+        along = compose(along, edge.estimate)
+    for expected, found in (
+        (along, graph.relative(vertex(2), vertex(5))),
+        (inverse(along), graph.relative(vertex(5), vertex(2))),
+    ):
+        assert found.pose.equals(expected.pose, 1e-6)
+        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-4, atol=1e-9)
+
+
+def test_relative_follows_an_update(looped: tuple[World, JointGraph]) -> None:
+    world, graph = looped
+    before = graph.relative(vertex(1), vertex(8)).covariance
+    graph.update(add=[world.edge(70, 1, 8, EdgeKind.LOOP)])
+    after = graph.relative(vertex(1), vertex(8)).covariance
+    assert np.linalg.det(after) < 0.5 * np.linalg.det(before)
+
+
+def test_innovation_is_chi2_over_honest_worlds() -> None:
+    """Over many worlds the innovation of a true loop has mean 3: the joint covariance is honest, in the right frame."""
+    values = []
+    for seed in range(300):
+        world = World(1000 + seed, 8)
+        values.append(built(world.chain()).innovation(world.edge(50, 7, 1, EdgeKind.LOOP)))
+    assert np.mean(values) == pytest.approx(3.0, abs=4.0 * np.sqrt(6.0 / 300.0))
+
+
+def test_chi2_is_the_squared_whitened_residual(looped: tuple[World, JointGraph]) -> None:
+    _, graph = looped
+    for edge in graph.edges():
+        found = graph.estimate(edge.tail).between(graph.estimate(edge.head))
+        residual = gtsam.Pose2.Logmap(edge.measurement.between(found))
+        expected = residual @ np.linalg.solve(edge.covariance, residual)
+        assert graph.chi2(edge.id) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def ring(count: int, rng: np.random.Generator) -> list[gtsam.Pose2]:
+    """True poses on a circle of steps of 8 m, back where it began."""
+    poses = [gtsam.Pose2()]
+    for _ in range(count - 1):
+        poses.append(poses[-1].compose(gtsam.Pose2(8.0, 0.0, 2.0 * np.pi / count)))
+    return poses
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_true_loop_after_a_long_drift_is_kept(seed: int) -> None:
+    world = World(seed, 1)
+    world.truth = ring(60, world.rng)
+    graph = built(world.chain())
+    loop = world.edge(100, 59, 0, EdgeKind.LOOP)
+    drift = gtsam.Pose2.Logmap(loop.measurement.between(graph.relative(loop.tail, loop.head).pose))
+    residual = float(drift @ np.linalg.solve(loop.covariance, drift))
+    assert residual > 100.0  # far outside the kernel
+    graph.update(add=[loop])
+    assert graph.chi2(loop.id) < 1.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_false_loop_does_not_bend_the_map(seed: int) -> None:
+    world = World(seed, 1)
+    world.truth = ring(20, world.rng)
+    graph = built([*world.chain(), world.edge(100, 19, 0, EdgeKind.LOOP), world.edge(101, 10, 0, EdgeKind.LOOP)])
+    before = graph.estimates()
+    false = world.edge(102, 15, 3, EdgeKind.LOOP, off=(3.0, -1.0, 0.3))
+    assert graph.innovation(false) > 100.0
+    graph.update(add=[false])
+    assert distance(graph.estimates(), before) < 0.01
+    assert graph.chi2(false.id) > 1000.0
+    graph.update(remove=[false.id])
+    assert distance(graph.estimates(), before) < 1e-4
+
+
+def test_a_loop_may_be_the_only_hold_of_a_vertex() -> None:
+    world = World(14, 4)
+    graph = built(world.chain())
+    graph.update(replace=[world.edge(2, 2, 3, EdgeKind.LOOP, version=1)])
+    graph.update(replace=[world.edge(1, 1, 2, EdgeKind.LOOP, 1), world.edge(2, 2, 3, EdgeKind.LOOP, 2)])
+    assert distance(graph.estimates(), batch_optimum(graph, graph.estimates())) < 1e-4
+    with pytest.raises(GraphError, match="vertices red:3 would be cut off"):
+        graph.update(remove=[EdgeId("red", 2)])
+
+
+def test_checkpoint_goes_through_json_and_goes_on(looped: tuple[World, JointGraph]) -> None:
+    world, graph = looped
+    back = JointGraph.restore(json.loads(json.dumps(graph.checkpoint())))
+    assert back.root == graph.root
+    assert back.vertices() == graph.vertices()
+    assert [str(e) for e in back.edges()] == [str(e) for e in graph.edges()]
+    assert distance(back.estimates(), graph.estimates()) < 1e-5
+    change = world.edge(70, 9, 5, EdgeKind.LOOP)
+    for one in (graph, back):
+        one.update(add=[change], remove=[EdgeId("red", 50)])
+    assert distance(back.estimates(), graph.estimates()) < 1e-5
+    np.testing.assert_allclose(back.marginal(vertex(9)), graph.marginal(vertex(9)), rtol=1e-3, atol=1e-10)
+
+
+def test_restore_refuses_what_is_no_checkpoint(looped: tuple[World, JointGraph]) -> None:
+    data = looped[1].checkpoint()
+    with pytest.raises(GraphError, match="not a checkpoint"):
+        JointGraph.restore({"root": [0.0, 0.0, 0.0]})
+    with pytest.raises(GraphError, match="cut off"):
+        JointGraph.restore(data | {"edges": data["edges"][:3]})
+    with pytest.raises(GraphError, match="red:9 is not in"):
+        JointGraph.restore(data | {"vertices": data["vertices"][:-1]})
+
+
+def test_optimize_fully_stays_at_the_optimum(looped: tuple[World, JointGraph]) -> None:
+    world, graph = looped
+    before = graph.estimates()
+    graph.optimize_fully()
+    assert distance(graph.estimates(), before) < 1e-4
+    graph.update(add=[world.edge(70, 9, 5, EdgeKind.LOOP)])
+    assert distance(graph.estimates(), batch_optimum(graph, graph.estimates())) < 1e-4
+
+
+def test_root_may_stand_anywhere() -> None:
+    world = World(15, 4)
+    pose = gtsam.Pose2(10.0, -5.0, 2.0)
+    graph = JointGraph(vertex(0), pose)
+    graph.update(add=world.chain())
+    assert graph.estimate(vertex(0)).equals(pose, 1e-9)
+    assert JointGraph.restore(graph.checkpoint()).estimate(vertex(3)).equals(graph.estimate(vertex(3)), 1e-9)
+
+
+def test_g2o_is_read_back_by_gtsam(looped: tuple[World, JointGraph], tmp_path: Path) -> None:
+    _, graph = looped
+    path = tmp_path / "graph.g2o"
+    graph.write_g2o(path)
+    factors, values = gtsam.readG2o(str(path), False)
+    assert factors.size() == len(graph.edges())
+    read = {v: values.atPose2(i) for i, v in enumerate(graph.vertices())}
+    assert distance(read, graph.estimates()) < 1e-9
+    for i, edge in enumerate(graph.edges()):
+        factor = factors.at(i)
+        assert isinstance(factor, gtsam.BetweenFactorPose2)
+        assert factor.measured().equals(edge.measurement, 1e-9)
+        noise = factor.noiseModel()
+        assert isinstance(noise, gtsam.noiseModel.Gaussian)
+        np.testing.assert_allclose(noise.covariance(), edge.covariance, rtol=1e-9, atol=1e-15)
+
+
+def test_closed_square_is_a_square() -> None:
+    side, covariance = gtsam.Pose2(5.0, 0.0, np.pi / 2), np.eye(3) * 1e-2
+    edges = [
+        Edge(EdgeId("red", i), 0, EdgeKind.INTER_VERTEX, vertex(i), vertex((i + 1) % 4), side, covariance)
+        for i in range(4)
+    ]
+    graph = built(edges)
+    assert graph.estimate(vertex(2)).equals(gtsam.Pose2(5.0, 5.0, np.pi), 1e-6)
+    assert sum(graph.chi2(edge.id) for edge in edges) == pytest.approx(0.0, abs=1e-9)
