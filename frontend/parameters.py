@@ -77,12 +77,12 @@ class Section:
 class MotionParameters(Section):
     """Standard deviations of one odometry increment: a floor, and growth with the distance and the turn."""
 
-    xy_floor: Annotated[float, Parameter("m", "position noise of any increment", gt=0)] = 0.005
+    xy_floor: Annotated[float, Parameter("m", "position noise of any increment", gt=0)] = 0.003
     xy_per_metre: Annotated[float, Parameter("m/m", "position noise for each metre driven", ge=0)] = 0.1
-    xy_per_radian: Annotated[float, Parameter("m/rad", "position noise for each radian turned", ge=0)] = 0.05
+    xy_per_radian: Annotated[float, Parameter("m/rad", "position noise for each radian turned", ge=0)] = 0.1
     theta_floor: Annotated[float, Parameter("rad", "heading noise of any increment", gt=0)] = 0.003
     theta_per_radian: Annotated[float, Parameter("rad/rad", "heading noise for each radian turned", ge=0)] = 0.1
-    theta_per_metre: Annotated[float, Parameter("rad/m", "heading noise for each metre driven", ge=0)] = 0.03
+    theta_per_metre: Annotated[float, Parameter("rad/m", "heading noise for each metre driven", ge=0)] = 0.05
 
 
 @dataclass(frozen=True)
@@ -96,12 +96,15 @@ class FilterParameters(Section):
     )
     map_width: Annotated[
         float, Parameter("m", "width of a local map", paper="4 d_s = 40 m in the text, 20 m in the experiments", gt=0)
-    ] = 40.0
+    ] = 60.0
     travel_square: Annotated[
         float, Parameter("m", "a robot that leaves this square around the origin leaves the map", paper="2 d_s", gt=0)
     ] = 20.0
-    sigma: Annotated[float, Parameter("m", "standard deviation of an endpoint across its wall", gt=0)] = 0.03
+    max_beams: Annotated[int, Parameter("", "of a scan with more beams an even subset is used", ge=10)] = 181
+    key_distance: Annotated[float, Parameter("m", "the filter takes a step after this way", gt=0)] = 0.2
+    key_angle: Annotated[float, Parameter("rad", "or after this turn", gt=0)] = 0.2
+    sigma: Annotated[float, Parameter("m", "standard deviation of an endpoint across its wall", gt=0)] = 0.02
     temper: Annotated[
         float, Parameter("", "weight of a scan's likelihood; below 1 because beams are not independent", gt=0, le=1)
-    ] = 0.05
+    ] = 0.1
     motion: MotionParameters = field(default_factory=MotionParameters)

@@ -1,0 +1,102 @@
+"""One visit to a vertex: the particle filter run over its scans, and what it leaves when the robot goes (M3)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from frontend import motion, se2
+from frontend.grid import Maps
+from frontend.parameters import FilterParameters
+from frontend.points import Points
+from frontend.rbpf import ParticleFilter, Step
+from frontend.records import FloatArray
+from frontend.refine import refine
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """What a visit leaves behind.
+
+    Attributes:
+        poses: (n, 3) local_T_robot at each of its scans.
+        covariance: (3, 3) of the last pose, in the robot's tangent frame.
+        maps: the vertex's map, a stack of one.
+    """
+
+    poses: FloatArray
+    covariance: FloatArray
+    maps: Maps
+
+
+class LocalSlam:
+    """Runs the filter in one vertex after another."""
+
+    def __init__(self, parameters: FilterParameters, seed: int) -> None:
+        self.parameters = parameters
+        self.filter = ParticleFilter(parameters, seed)
+        self._points: list[Points] = []
+        self._increments: list[FloatArray] = []
+        self._offsets: list[FloatArray] = []  # pose seen from that at the key scan before
+        self._keys: list[int] = []  # which step of the filter that was
+        self._steps = 0
+        self._base: Maps | None = None
+        self._mapping = True
+
+    def begin(self, points: Points, poses: FloatArray, known: Maps | None = None) -> None:
+        """Start a visit with its first scan at ``poses`` (particles, 3).
+
+        With a ``known`` map (a stack of one) the particles only localise in it until ``settle``.
+        """
+        self._base, self._mapping = known, known is None
+        self.filter.start(poses, known)
+        self._points, self._increments = [points], [np.zeros(3)]
+        self._offsets, self._keys, self._steps = [np.zeros(3)], [0], 0
+        if self._mapping:
+            self.filter.insert(points, poses)
+
+    def add(self, points: Points, increment: FloatArray) -> Step:
+        """Take the next scan, ``increment`` (3,) of odometry after the last one."""
+        p = self.parameters
+        step = self.filter.track(points, increment)
+        offset = se2.between(self.filter.poses[self.filter.leader], step.pose)
+        if np.hypot(offset[0], offset[1]) >= p.key_distance or abs(offset[2]) >= p.key_angle:
+            self._update(points)
+            offset = np.zeros(3)
+        self._points.append(points)
+        self._increments.append(increment)
+        self._offsets.append(offset)
+        self._keys.append(self._steps)
+        return step
+
+    def settle(self) -> None:
+        """The localisation in the known map holds: from now on, and in hindsight, the scans are mapped as well."""
+        self._mapping = True
+        paths = self.filter.paths()
+        at = {step: i for i, step in reversed(list(enumerate(self._keys)))}
+        for step in range(self._steps + 1):
+            self.filter.insert(self._points[at[step]], paths[step])
+
+    def finish(self) -> Visit:
+        """End the visit: the best particle's path, made better by the whole map it led to."""
+        if np.any(self._offsets[-1]):
+            self._update(self._points[-1])
+            self._offsets[-1] = np.zeros(3)
+            self._keys[-1] = self._steps
+        _, covariance = self.filter.pose_and_covariance()
+        increments = np.array(self._increments)
+        variances = np.array([motion.variance(i, self.parameters.motion) for i in increments])
+        poses, maps = refine(self._points, self.path(), increments, variances, self._base, self.parameters)
+        return Visit(poses, covariance, maps)
+
+    def path(self) -> FloatArray:
+        """(n, 3) local_T_robot of the best particle at each scan of the visit so far."""
+        best = self.filter.paths()[:, self.filter.leader]
+        return se2.compose(best[self._keys], np.array(self._offsets))
+
+    def scans(self) -> list[tuple[Points, FloatArray]]:
+        """The visit's scans with the odometry increments that led to them, to take them elsewhere."""
+        return list(zip(self._points, self._increments, strict=True))
+
+    def _update(self, points: Points) -> None:
+        self.filter.update(points, self._mapping)
+        self._steps += 1

@@ -1,0 +1,266 @@
+"""Scan-to-map matching: Gauss-Newton on point-to-line distances, and a correlative search where that cannot start.
+
+An endpoint is compared with the nearest surfel of the map: across the surface only where the surfel is a line, in both
+directions where it is a corner or a post. So a corridor leaves the direction along it free, and the Hessian says so.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from frontend.grid import NX, NY, N, X, Y
+
+MAX_ITERATIONS = 15
+FIRST_GATE = 0.30  # metres: how far from a surfel an endpoint may lie in the first iteration,
+LAST_GATE = 0.10  # and in the last
+GATE_SHRINK = 0.6  # per iteration
+COHERENCE = 0.6  # length of a surfel's mean normal above which it is a line
+FACING = 0.5  # cosine between the normals of an endpoint and its surfel below which they are different surfaces
+POST = 2.0  # a corner's endpoints scatter this many times wider than a wall's
+CORE = 2.0  # Geman-McClure: residuals beyond this many sigma lose their say
+STEP_XY = 2e-4  # metres and
+STEP_THETA = 5e-5  # radians: the iteration has converged
+FREE = -10  # log-odds (steps) below which a cell is known to be free
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def match(log_odds, index, surfels, resolution, hits, start, prior, information, sigma, hessian):  # type: ignore[no-untyped-def]
+    """Find the pose near ``start`` that fits ``hits`` to the map, weighed against a prior on the pose.
+
+    Args:
+        start: (3,) pose, overwritten by the result.
+        prior: (3,) pose the motion model expects.
+        information: (3, 3) of the prior, in map coordinates; its tail is heavy (Cauchy), as odometry may lie.
+        sigma: standard deviation of an endpoint across a wall, metres.
+        hessian: (3, 3) out: information of the scan alone at the result, map coordinates.
+
+    Returns:
+        (fit, near, free, log_likelihood): the sum over endpoints of how well the map explains each (0 to 1); how many
+        have a surfel; how many lie in free space instead; and the log-likelihood relative to that of a perfect fit.
+        Endpoints in unknown space count for nothing.
+    """
+    rows, columns = index.shape
+    inv = 1.0 / resolution
+    half_u = 0.5 * columns
+    half_v = 0.5 * rows
+    x, y, theta = start[0], start[1], start[2]
+    weight_line = 1.0 / (sigma * sigma)
+    weight_post = weight_line / (POST * POST)
+    core = 1.0 / (CORE * CORE)
+    gate = FIRST_GATE
+    last = False
+    fit = 0.0
+    free = 0
+    near = 0
+    log_likelihood = 0.0
+    for iteration in range(MAX_ITERATIONS + 1):
+        c = math.cos(theta)
+        s = math.sin(theta)
+        a00 = a01 = a02 = a11 = a12 = a22 = 0.0
+        b0 = b1 = b2 = 0.0
+        fit = 0.0
+        free = 0
+        near = 0
+        log_likelihood = 0.0
+        gate2 = gate * gate
+        for i in range(len(hits)):
+            rx = c * hits[i, 0] - s * hits[i, 1]
+            ry = s * hits[i, 0] + c * hits[i, 1]
+            px = rx + x
+            py = ry + y
+            u = int(px * inv + half_u)
+            v = int(py * inv + half_v)
+            if u < 0 or v < 0 or u >= columns or v >= rows:
+                continue
+            k = index[v, u]
+            found = False
+            m = 0.0
+            if k > 0 and surfels[k, N] > 0.0:
+                dx = px - surfels[k, X]
+                dy = py - surfels[k, Y]
+                d2 = dx * dx + dy * dy
+                if d2 < gate2:
+                    nx = surfels[k, NX]
+                    ny = surfels[k, NY]
+                    length = math.sqrt(nx * nx + ny * ny)
+                    if length > COHERENCE:
+                        hx = c * hits[i, 2] - s * hits[i, 3]
+                        hy = s * hits[i, 2] + c * hits[i, 3]
+                        nx /= length
+                        ny /= length
+                        if (hx == 0.0 and hy == 0.0) or hx * nx + hy * ny > FACING:
+                            found = True
+                            e = nx * dx + ny * dy
+                            m = e * e * weight_line
+                            w = 1.0 / (1.0 + m * core)
+                            w = weight_line * w * w
+                            j2 = ny * rx - nx * ry
+                            a00 += w * nx * nx
+                            a01 += w * nx * ny
+                            a02 += w * nx * j2
+                            a11 += w * ny * ny
+                            a12 += w * ny * j2
+                            a22 += w * j2 * j2
+                            b0 += w * nx * e
+                            b1 += w * ny * e
+                            b2 += w * j2 * e
+                    else:
+                        found = True
+                        m = d2 * weight_post
+                        w = 1.0 / (1.0 + m * core)
+                        w = weight_post * w * w
+                        a00 += w
+                        a02 -= w * ry
+                        a11 += w
+                        a12 += w * rx
+                        a22 += w * (rx * rx + ry * ry)
+                        b0 += w * dx
+                        b1 += w * dy
+                        b2 += w * (rx * dy - ry * dx)
+            if found:
+                near += 1
+                g = 1.0 / (1.0 + 0.25 * m)
+                fit += g
+                log_likelihood -= 0.5 * m / (1.0 + m * core)
+            elif log_odds[v, u] < FREE:
+                free += 1
+                log_likelihood -= 0.5 / core
+        hessian[0, 0] = a00
+        hessian[0, 1] = a01
+        hessian[0, 2] = a02
+        hessian[1, 0] = a01
+        hessian[1, 1] = a11
+        hessian[1, 2] = a12
+        hessian[2, 0] = a02
+        hessian[2, 1] = a12
+        hessian[2, 2] = a22
+        if last or iteration == MAX_ITERATIONS:
+            break
+        e0 = x - prior[0]
+        e1 = y - prior[1]
+        e2 = theta - prior[2]
+        i0 = information[0, 0] * e0 + information[0, 1] * e1 + information[0, 2] * e2
+        i1 = information[1, 0] * e0 + information[1, 1] * e1 + information[1, 2] * e2
+        i2 = information[2, 0] * e0 + information[2, 1] * e1 + information[2, 2] * e2
+        w = 1.0 / (1.0 + (e0 * i0 + e1 * i1 + e2 * i2) / 9.0)
+        a00 += w * information[0, 0]
+        a01 += w * information[0, 1]
+        a02 += w * information[0, 2]
+        a11 += w * information[1, 1]
+        a12 += w * information[1, 2]
+        a22 += w * information[2, 2]
+        b0 += w * i0
+        b1 += w * i1
+        b2 += w * i2
+        c00 = a11 * a22 - a12 * a12
+        c01 = a02 * a12 - a01 * a22
+        c02 = a01 * a12 - a02 * a11
+        det = a00 * c00 + a01 * c01 + a02 * c02
+        if det <= 0.0:
+            break
+        d0 = (c00 * b0 + c01 * b1 + c02 * b2) / det
+        d1 = (c01 * b0 + (a00 * a22 - a02 * a02) * b1 + (a01 * a02 - a00 * a12) * b2) / det
+        d2 = (c02 * b0 + (a01 * a02 - a00 * a12) * b1 + (a00 * a11 - a01 * a01) * b2) / det
+        x -= d0
+        y -= d1
+        theta -= d2
+        if gate <= LAST_GATE and abs(d0) < STEP_XY and abs(d1) < STEP_XY and abs(d2) < STEP_THETA:
+            last = True
+        gate = max(LAST_GATE, gate * GATE_SHRINK)
+    start[0] = x
+    start[1] = y
+    start[2] = theta
+    return fit, near, free, log_likelihood
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def search(log_odds, index, surfels, resolution, hits, centre, reach_xy, step_xy, reach_theta, step_theta, information, stride, peaks, scores):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Correlative search: score all poses of a lattice around ``centre`` and keep the best local ones.
+
+    The score of a pose is the fraction of endpoints near a surfel less that of endpoints in free space, less the prior's
+    squared Mahalanobis distance (``information`` (3, 3), map coordinates) with a Cauchy tail.
+
+    Args:
+        peaks: (K, 3) out: best poses, best first, no two within two steps of each other.
+        scores: (K,) out.
+
+    Returns:
+        number of peaks found.
+    """
+    rows, columns = index.shape
+    inv = 1.0 / resolution
+    half_u = 0.5 * columns
+    half_v = 0.5 * rows
+    n_xy = int(math.ceil(reach_xy / step_xy))
+    n_theta = int(math.ceil(reach_theta / step_theta))
+    size = len(peaks)
+    found = 0
+    used = (len(hits) + stride - 1) // stride
+    if used == 0:
+        return 0
+    rx = np.empty(used, np.float32)
+    ry = np.empty(used, np.float32)
+    for it in range(-n_theta, n_theta + 1):
+        theta = centre[2] + it * step_theta
+        c = math.cos(theta)
+        s = math.sin(theta)
+        for i in range(used):
+            rx[i] = (c * hits[i * stride, 0] - s * hits[i * stride, 1] + centre[0]) * inv + half_u
+            ry[i] = (s * hits[i * stride, 0] + c * hits[i * stride, 1] + centre[1]) * inv + half_v
+        for iy in range(-n_xy, n_xy + 1):
+            for ix in range(-n_xy, n_xy + 1):
+                ox = ix * step_xy * inv
+                oy = iy * step_xy * inv
+                near = 0
+                free = 0
+                for i in range(used):
+                    u = int(rx[i] + ox)
+                    v = int(ry[i] + oy)
+                    if 0 <= u < columns and 0 <= v < rows:
+                        k = index[v, u]
+                        if k > 0:
+                            near += 1
+                        elif log_odds[v, u] < FREE:
+                            free += 1
+                e0 = ix * step_xy
+                e1 = iy * step_xy
+                e2 = it * step_theta
+                q = (
+                    information[0, 0] * e0 * e0 + information[1, 1] * e1 * e1 + information[2, 2] * e2 * e2
+                    + 2.0 * (information[0, 1] * e0 * e1 + information[0, 2] * e0 * e2 + information[1, 2] * e1 * e2)
+                )  # fmt: skip
+                score = (near - free) / used - 0.05 * math.log(1.0 + q / 9.0)
+                if found == size and score <= scores[size - 1]:
+                    continue
+                x = centre[0] + e0
+                y = centre[1] + e1
+                # A neighbour of a kept peak either replaces it or is dropped.
+                place = -1
+                beaten = False
+                for k in range(found):
+                    if (
+                        abs(peaks[k, 0] - x) <= 2.01 * step_xy
+                        and abs(peaks[k, 1] - y) <= 2.01 * step_xy
+                        and abs(peaks[k, 2] - theta) <= 2.01 * step_theta
+                    ):
+                        if scores[k] >= score:
+                            beaten = True
+                        else:
+                            place = k
+                        break
+                if beaten:
+                    continue
+                if place < 0:
+                    if found < size:
+                        found += 1
+                    place = found - 1
+                while place > 0 and scores[place - 1] < score:
+                    scores[place] = scores[place - 1]
+                    peaks[place] = peaks[place - 1]
+                    place -= 1
+                scores[place] = score
+                peaks[place, 0] = x
+                peaks[place, 1] = y
+                peaks[place, 2] = theta
+    return found

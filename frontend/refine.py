@@ -1,0 +1,180 @@
+"""What a finished local map can still give to the poses it was made of.
+
+Inside a vertex a pose is only as good as the filter was at that time, with half a map. Once the map is whole, every scan
+is matched against it again and the matches are tied together by odometry, the map is drawn anew from the better
+poses, and so on.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from frontend import se2
+from frontend.grid import Maps, insert
+from frontend.matching import match
+from frontend.parameters import FilterParameters
+from frontend.points import Points
+from frontend.records import FloatArray
+
+ROUNDS = 2  # of drawing the map and matching against it
+LEASH = np.diag([1.0 / 0.05**2, 1.0 / 0.05**2, 1.0 / 0.03**2])  # information that keeps a match near where it starts
+DRAW_DISTANCE = 0.10  # metres or
+DRAW_ANGLE = 0.10  # radians between the scans that the map is drawn from
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _match_all(log_odds, index, surfels, resolution, hits, ends, poses, information, sigma, hessians, fits):  # type: ignore[no-untyped-def]
+    for i in prange(len(poses)):
+        first = ends[i - 1] if i else 0
+        prior = poses[i].copy()
+        fit, near, free, _ = match(
+            log_odds, index, surfels, resolution, hits[first : ends[i]], poses[i], prior, information, sigma, hessians[i]
+        )
+        fits[i] = fit / max(1, near + free)
+
+
+@njit(cache=True, nogil=True)
+def _smooth(poses, matched, hessians, motions, variances, out):  # type: ignore[no-untyped-def]
+    """One Gauss-Newton step of the chain: scan matches as unary, odometry as binary factors; block tridiagonal."""
+    n = len(poses)
+    diagonal = np.zeros((n, 3, 3))
+    upper = np.zeros((n, 3, 3))
+    right = np.zeros((n, 3))
+    for i in range(n):
+        e = poses[i] - matched[i]
+        diagonal[i] += hessians[i]
+        right[i] -= hessians[i] @ e
+    for i in range(1, n):
+        theta = poses[i - 1, 2]
+        c = math.cos(theta)
+        s = math.sin(theta)
+        dx = poses[i, 0] - poses[i - 1, 0]
+        dy = poses[i, 1] - poses[i - 1, 1]
+        e = np.empty(3)
+        e[0] = c * dx + s * dy - motions[i, 0]
+        e[1] = c * dy - s * dx - motions[i, 1]
+        t = poses[i, 2] - poses[i - 1, 2] - motions[i, 2]
+        e[2] = t - 2.0 * math.pi * math.floor((t + math.pi) / (2.0 * math.pi))
+        a = np.zeros((3, 3))
+        a[0, 0] = -c
+        a[0, 1] = -s
+        a[0, 2] = c * dy - s * dx
+        a[1, 0] = s
+        a[1, 1] = -c
+        a[1, 2] = -c * dx - s * dy
+        a[2, 2] = -1.0
+        b = np.zeros((3, 3))
+        b[0, 0] = c
+        b[0, 1] = s
+        b[1, 0] = -s
+        b[1, 1] = c
+        b[2, 2] = 1.0
+        w = np.zeros((3, 3))
+        q = 0.0
+        for k in range(3):
+            q += e[k] * e[k] / variances[i, k]
+        scale = 1.0 / (1.0 + q / 9.0)
+        for k in range(3):
+            w[k, k] = scale / variances[i, k]
+        diagonal[i - 1] += a.T @ w @ a
+        diagonal[i] += b.T @ w @ b
+        upper[i - 1] += a.T @ w @ b
+        right[i - 1] -= a.T @ (w @ e)
+        right[i] -= b.T @ (w @ e)
+    for i in range(1, n):
+        f = np.linalg.solve(diagonal[i - 1], upper[i - 1]).T
+        diagonal[i] -= f @ upper[i - 1]
+        right[i] -= f @ right[i - 1]
+    step = np.linalg.solve(diagonal[n - 1], right[n - 1])
+    out[n - 1] = poses[n - 1] + step
+    for i in range(n - 2, -1, -1):
+        step = np.linalg.solve(diagonal[i], right[i] - upper[i] @ step)
+        out[i] = poses[i] + step
+
+
+@njit(cache=True, nogil=True)
+def _draw(log_odds, index, surfels, count, bounds, resolution, hits, ends, clear, clear_ends, sensor, poses):  # type: ignore[no-untyped-def]
+    last = -1
+    for i in range(len(poses)):
+        if last >= 0:
+            dx = poses[i, 0] - poses[last, 0]
+            dy = poses[i, 1] - poses[last, 1]
+            turn = poses[i, 2] - poses[last, 2]
+            turn = abs(turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi)))
+            if dx * dx + dy * dy < DRAW_DISTANCE * DRAW_DISTANCE and turn < DRAW_ANGLE:
+                continue
+        last = i
+        first = ends[i - 1] if i else 0
+        clear_first = clear_ends[i - 1] if i else 0
+        count = insert(
+            log_odds, index, surfels, count, bounds, resolution, poses[i],
+            hits[first : ends[i]], clear[clear_first : clear_ends[i]], sensor, True,
+        )  # fmt: skip
+    return count
+
+
+def _drawn(base: Maps | None, packed: "_Packed", poses: FloatArray, parameters: FilterParameters) -> Maps:
+    maps = Maps.empty(1, parameters.map_width, parameters.resolution)
+    if base is not None:
+        maps.copy_from(base, np.zeros(1, np.int64))
+    m = maps
+    m.counts[0] = _draw(
+        m.log_odds[0], m.index[0], m.surfels[0], m.counts[0], m.bounds[0], m.resolution,
+        packed.hits, packed.ends, packed.clear, packed.clear_ends, packed.sensor, poses,
+    )  # fmt: skip
+    return maps
+
+
+class _Packed:
+    """Many scans in one piece, as the kernels take them."""
+
+    def __init__(self, points: list[Points]) -> None:
+        self.hits = np.concatenate([p.hits for p in points])
+        self.ends = np.cumsum([len(p.hits) for p in points])
+        self.clear = np.concatenate([p.clear for p in points])
+        self.clear_ends = np.cumsum([len(p.clear) for p in points])
+        self.sensor = points[0].sensor
+
+
+def refine(
+    points: list[Points], poses: FloatArray, increments: FloatArray, variances: FloatArray, base: Maps | None,
+    parameters: FilterParameters,
+) -> tuple[FloatArray, Maps]:  # fmt: skip
+    """Better poses for the scans of one visit to a vertex, and the vertex's map drawn from them.
+
+    Args:
+        points: the n scans.
+        poses: (n, 3) local_T_robot as the filter left them.
+        increments: (n, 3) odometry from the scan before; the first is not used.
+        variances: (n, 3) of the increments, robot frame.
+        base: what earlier visits knew (a stack of one); it stays, and holds the new poses in its frame. Without it the
+            first pose keeps its place.
+
+    Returns:
+        (n, 3) poses and the map, a stack of one.
+    """
+    packed = _Packed(points)
+    n = len(points)
+    origin = poses[0]
+    maps = _drawn(base, packed, poses, parameters)
+    for _ in range(ROUNDS):
+        matched = poses.copy()
+        hessians = np.empty((n, 3, 3))
+        _match_all(
+            maps.log_odds[0], maps.index[0], maps.surfels[0], maps.resolution,
+            packed.hits, packed.ends, matched, LEASH, parameters.sigma, hessians, np.empty(n),
+        )  # fmt: skip
+        hessians *= parameters.temper
+        hessians += 1e-3 * np.eye(3)
+        smoothed = matched
+        for _ in range(2):
+            result = np.empty_like(smoothed)
+            _smooth(smoothed, matched, hessians, increments, variances, result)
+            smoothed = result
+        poses = smoothed
+        if base is None:
+            poses = se2.compose(origin, se2.between(poses[0], poses))
+        maps = _drawn(base, packed, poses, parameters)
+    poses[:, 2] = se2.wrap(poses[:, 2])
+    return poses, maps

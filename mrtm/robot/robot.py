@@ -1,0 +1,209 @@
+"""One robot's TM-SLAM: steps M1 to M8, scan by scan."""
+
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
+
+import numpy as np
+
+from factors import Edge, EdgeKind, UncertainPose, VertexId, compose, intersect, inverse
+from frontend import se2
+from frontend.local_slam import LocalSlam
+from frontend.points import Points, points_of
+from frontend.records import FloatArray, LaserScan
+from frontend.relocalisation import hypotheses, spread
+from mrtm.config import Config
+from mrtm.result import Event
+from mrtm.robot.reentry import Candidate, Trial, array_of, candidates, pose_of
+from mrtm.robot.topology import Topology, Vertex
+
+
+class Joint(Protocol):
+    """What the robot needs of the joint map: to tell it about edges, and to ask where a vertex is."""
+
+    def update(self, *, add: Iterable[Edge] = (), replace: Iterable[Edge] = ()) -> None:
+        """Enter new edges and new versions of known ones."""
+
+    def relative(self, a: VertexId, b: VertexId) -> UncertainPose:
+        """a_T_b with its covariance in the frame of b."""
+
+
+class Robot:
+    """Maps with one robot; feed it scans with ``process`` and end with ``finish``.
+
+    Args:
+        name: the robot's.
+        config: of the run.
+        make_joint: given the first vertex (M1), the joint map to work with.
+        notify: told of every event.
+    """
+
+    def __init__(
+        self, name: str, config: Config, make_joint: Callable[[VertexId], Joint], notify: Callable[[Event], None]
+    ) -> None:
+        self.name = name
+        self.config = config
+        self.topology = Topology(name)
+        self.times: list[float] = []
+        self._notify = notify
+        self._slam = LocalSlam(config.frontend, config.seed)
+        self._random = np.random.default_rng(config.seed)
+        self._half_width = 0.5 * config.frontend.travel_square
+        self._odometry = np.zeros(3)
+        self._here = self.topology.new_vertex()  # M1
+        self._joint = make_joint(self._here.id)
+        self._entered: tuple[Edge, UncertainPose] | None = None  # edge come by, pose on it at leaving the other vertex
+        self._trial: Trial | None = None
+        self._scan = -1  # index of the present scan
+        self._first = 0  # index of the present visit's first scan
+
+    def process(self, scan: LaserScan) -> None:
+        """M2: take the next scan."""
+        points = points_of(scan, self.config.frontend.sensing_range, self.config.frontend.max_beams)
+        increment = se2.between(self._odometry, scan.odometry)
+        self._odometry = scan.odometry
+        self._scan += 1
+        self.times.append(scan.time)
+        if self._scan == 0:
+            self._slam.begin(points, np.zeros((self.config.frontend.particles, 3)))
+        else:
+            self._advance(points, increment)
+
+    def finish(self) -> None:
+        """M12: the log is at its end; close the vertex the robot is in."""
+        if self._scan < 0:
+            return
+        if self._trial is not None:
+            self._judge(leaving=True)
+        self._leave_map()
+
+    def _advance(self, points: Points, increment: FloatArray) -> None:
+        step = self._slam.add(points, increment)  # M3
+        if step.searched:
+            self._tell("searched wider", level=step.searched, fit=step.fit, known=step.known)
+        outside = bool(np.max(np.abs(step.pose[:2])) > self._half_width)  # M4
+        if self._trial is not None:
+            self._trial.add(step, increment)
+            outside = bool(np.max(np.abs(step.pose[:2])) > 1.5 * self._half_width)
+            self._judge(leaving=outside)
+        elif outside:
+            self._leave(points)
+
+    def _leave_map(self) -> UncertainPose:
+        """Close the present vertex's map; the robot's pose in it, with covariance."""
+        visit = self._slam.finish()
+        here = self._here
+        here.maps = visit.maps
+        here.scans.extend(range(self._first, self._first + len(visit.poses)))
+        here.poses.extend(visit.poses)
+        self._update_edge(UncertainPose(pose_of(visit.poses[0]), visit.covariance))
+        return UncertainPose(pose_of(visit.poses[-1]), visit.covariance)
+
+    def _update_edge(self, entered: UncertainPose) -> None:
+        """M5: the vertex was entered by a known edge and is well known now; fuse the edge with what entering measured."""
+        if self._entered is None:
+            return
+        edge, left = self._entered
+        self._entered = None
+        measured = compose(left, inverse(entered))  # previous_T_here
+        if edge.head != self._here.id:
+            measured = inverse(measured)
+        if edge.kind is EdgeKind.LOOP and edge.version == 0:
+            # The edge this visit made (M8): its measurement with the pose as it is known now.
+            kind, fused = EdgeKind.LOOP, measured
+        else:
+            kind, fused = EdgeKind.COVARIANCE_INTERSECTION, intersect(edge.estimate, measured, self.config.topology.omega)
+        newer = Edge(edge.id, edge.version + 1, kind, edge.tail, edge.head, fused.pose, fused.covariance)
+        self.topology.put(newer)
+        self._joint.update(replace=[newer])
+        self._tell("edge updated", edge=str(newer), offset=_offset(edge.estimate, measured))
+
+    def _leave(self, points: Points) -> None:
+        """The robot has left the 2 d_s square (M4)."""
+        left = self._leave_map()
+        for candidate in self._candidates(left)[: self.config.topology.candidates]:
+            if self._enter_on_trial(candidate, left, points):
+                return
+        self._create_vertex(left, points)
+
+    def _candidates(self, left: UncertainPose) -> list[Candidate]:
+        """M6."""
+        p = self.config.topology
+        if p.projection == "dijkstra":
+            project = self.topology.along_shortest_paths(self._here.id)
+        else:
+            def project(vertex: VertexId) -> UncertainPose:
+                return self._joint.relative(self._here.id, vertex)
+
+        others = [v for v in self.topology.vertices if v is not self._here]
+        return candidates(left, others, project, self._half_width, p.reach)
+
+    def _enter_on_trial(self, candidate: Candidate, left: UncertainPose, points: Points) -> bool:
+        """M3 with FL_re-enter: particles where the old map explains the scan, within the projected covariance."""
+        known = candidate.vertex.maps
+        assert known is not None
+        p = self.config.topology
+        guess, covariance = array_of(candidate.estimate.pose), candidate.estimate.covariance
+        poses, scores = hypotheses(known, points, guess, covariance, self.config.frontend)
+        if not len(scores) or scores[0] < p.entry_score:
+            score = f"{scores[0]:.2f}" if len(scores) else "none"
+            self._tell("re-entry refused", vertex=str(candidate.vertex.id), reason=f"the scan does not fit: score {score}")
+            return False
+        particles = spread(poses, scores, self.config.frontend.particles, self._random)
+        self._trial = Trial(candidate, left, self._scan)
+        self._slam.begin(points, particles, known)
+        return True
+
+    def _judge(self, leaving: bool) -> None:
+        trial = self._trial
+        assert trial is not None
+        _, covariance = self._slam.filter.pose_and_covariance()
+        accepted, reason = trial.verdict(covariance, self.config.topology, leaving)
+        if accepted is None:
+            return
+        self._trial = None
+        vertex = trial.candidate.vertex
+        if accepted:
+            entered = UncertainPose(pose_of(self._slam.path()[0]), covariance)
+            self._slam.settle()
+            self._reenter(vertex, trial, entered, reason)
+            return
+        self._tell("re-entry refused", vertex=str(vertex.id), reason=reason)
+        scans = self._slam.scans()
+        self._create_vertex(trial.left, scans[0][0], trial.first_scan)
+        for points, increment in scans[1:]:
+            self._advance(points, increment)
+
+    def _reenter(self, vertex: Vertex, trial: Trial, entered: UncertainPose, reason: str) -> None:
+        """The robot is in a known vertex again; M8 if no edge leads there yet."""
+        previous = self._here
+        self._here, self._first = vertex, trial.first_scan
+        measured = compose(trial.left, inverse(entered))
+        edge = self.topology.between(previous.id, vertex.id)
+        expected = compose(trial.left, inverse(trial.candidate.estimate))
+        detail = dict(vertex=str(vertex.id), reason=reason, offset=_offset(expected, measured))
+        if edge is None:
+            edge = self.topology.new_edge(EdgeKind.LOOP, previous.id, vertex.id, measured)
+            self.topology.put(edge)
+            self._joint.update(add=[edge])
+            self._tell("loop closed", edge=str(edge), **detail)
+        else:
+            self._tell("re-entered", **detail)
+        self._entered = edge, trial.left
+
+    def _create_vertex(self, left: UncertainPose, points: Points, first_scan: int | None = None) -> None:
+        """M7: a new vertex where the robot is, joined to the one it left."""
+        vertex = self.topology.new_vertex()
+        edge = self.topology.new_edge(EdgeKind.INTER_VERTEX, self._here.id, vertex.id, left)
+        self.topology.put(edge)
+        self._joint.update(add=[edge])
+        self._here, self._first = vertex, self._scan if first_scan is None else first_scan
+        self._slam.begin(points, np.zeros((self.config.frontend.particles, 3)))
+        self._tell("new vertex", vertex=str(vertex.id))
+
+    def _tell(self, kind: str, **detail: Any) -> None:
+        self._notify(Event(self.times[-1], self.name, kind, detail))
+
+
+def _offset(expected: UncertainPose, measured: UncertainPose) -> list[float]:
+    """x, y, theta by which a measurement differs from what was expected."""
+    return [round(float(v), 4) for v in array_of(expected.pose.between(measured.pose))]

@@ -1,0 +1,95 @@
+"""A run: logs in, joint map out."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+
+from factors import VertexId
+from frontend.grid import UNIT, N, X
+from frontend.local_map import Grid, LocalMap
+from frontend.readers import open_log
+from mrtm.config import Config
+from mrtm.joint.graph import JointGraph
+from mrtm.output.export import export
+from mrtm.progress import Progress
+from mrtm.result import EdgeFate, Event, RunResult, Trajectory
+from mrtm.robot.robot import Robot
+from mrtm.robot.topology import Vertex
+
+
+def run_log(path: Path, out: Path, config: Config, progress: Progress) -> RunResult:
+    """Map one robot's log and write what a run leaves behind.
+
+    Raises:
+        LogError: the log cannot be read or holds no usable scan.
+    """
+    started = time.perf_counter()
+    log = open_log(path)
+    graphs: list[JointGraph] = []
+    events: list[Event] = []
+
+    def make_joint(root: VertexId) -> JointGraph:
+        graphs.append(JointGraph(root))
+        return graphs[-1]
+
+    robot = Robot("robot", config, make_joint, events.append)
+    for scan in log.scans():
+        robot.process(scan)
+        if len(robot.times) % 100 == 0:
+            progress(0.5, f"{len(robot.times)} scans, {len(robot.topology.vertices)} vertices")
+    robot.finish()
+    graph = graphs[0]
+    graph.optimize_fully()
+    mapped = time.perf_counter()
+    result = _result(robot, graph, config, events, {"mapping": mapped - started}, [str(log.report)])
+    export(result, out)
+    return result
+
+
+def _result(
+    robot: Robot, graph: JointGraph, config: Config, events: list[Event], timings: dict[str, float], blemishes: list[str]
+) -> RunResult:
+    topology = robot.topology
+    joint = {v.id: graph.estimate(v.id) for v in topology.vertices}
+    n = len(robot.times)
+    poses, inside = np.zeros((n, 3)), np.zeros(n, np.int64)
+    for vertex in topology.vertices:
+        from frontend import se2
+
+        pose = joint[vertex.id]
+        scans = np.array(vertex.scans, np.int64)
+        poses[scans] = se2.compose(np.array([pose.x(), pose.y(), pose.theta()]), np.array(vertex.poses).reshape(-1, 3))
+        inside[scans] = vertex.id.index
+    times = np.array(robot.times)
+    edges = topology.past + [EdgeFate(e, "accepted", chi2=graph.chi2(e.id)) for e in topology.edges.values()]
+    return RunResult(
+        config=config.model_dump(mode="json"),
+        seed=config.seed,
+        trajectories={robot.name: Trajectory(times, poses, inside)},
+        local_maps={v.id: _local_map(v, times) for v in topology.vertices},
+        vertex_poses=joint,
+        vertex_covariances={v.id: graph.marginal(v.id) for v in topology.vertices},
+        components=[[v.id for v in topology.vertices]],
+        edges=edges,
+        events=events,
+        timings=timings,
+        counts={"scans": n, "vertices": len(joint), "edges": len(topology.edges)},
+        blemishes=blemishes,
+    )
+
+
+def _local_map(vertex: Vertex, times: np.ndarray) -> LocalMap:
+    maps = vertex.maps
+    assert maps is not None
+    r0, r1, c0, c1 = maps.bounds[0]
+    cells = maps.log_odds.shape[1]
+    grid = Grid(
+        maps.log_odds[0, r0:r1, c0:c1].astype(np.float32) / UNIT,
+        maps.resolution,
+        (np.array([c0, r0]) - 0.5 * cells) * maps.resolution,
+    )
+    surfels = maps.surfels[0, 1 : maps.counts[0]]
+    order = np.argsort(vertex.scans, kind="stable")
+    scans = np.array(vertex.scans, np.int64)[order]
+    return LocalMap(grid, scans, times[scans], np.array(vertex.poses)[order], surfels[surfels[:, N] > 0, X : X + 2].astype(np.float64))
