@@ -1,0 +1,159 @@
+"""Evaluate what a run left behind in its output directory."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from frontend.records import FloatArray
+from mrtm.evaluation import se2
+from mrtm.evaluation.ate import AbsoluteErrors, evaluate_ate
+from mrtm.evaluation.errors import EvaluationError
+from mrtm.evaluation.nees import nees
+from mrtm.evaluation.relations import RelationErrors, evaluate_relations, read_relations
+from mrtm.evaluation.statistics import Statistics
+from mrtm.evaluation.trajectory import TimedPoses, interpolate, read_tum
+from mrtm.output.files import replacing, to_json
+
+_Name = tuple[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Honesty:
+    """Normalised estimation error squared of ``count`` poses against the truth; a mean near 1 is honest."""
+
+    nees: Statistics
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """What could be measured with what was given; None or empty where it was not.
+
+    Attributes:
+        relations: the relations metric over all relations.
+        relations_across: the same over relations between different robots' logs.
+        ate: the absolute trajectory error, one entry a connected component.
+        vertices: honesty of the joint vertex poses, seen from their component's root.
+        edges: honesty of the accepted edges, by kind.
+    """
+
+    relations: RelationErrors | None = None
+    relations_across: RelationErrors | None = None
+    ate: tuple[AbsoluteErrors, ...] = ()
+    vertices: Honesty | None = None
+    edges: dict[str, Honesty] | None = None
+
+
+def evaluate_output(
+    out: Path, relations: Path | None = None, truth: Mapping[str, Path] | Path | None = None
+) -> Evaluation:
+    """Measure the run in ``out`` and write ``out/evaluation.json``.
+
+    Args:
+        out: a directory that a run wrote: ``run.json`` and ``trajectory/*.tum`` are read.
+        relations: a file of true relative poses.
+        truth: TUM files by robot; a single file will do for a run of one robot.
+
+    Raises:
+        EvaluationError: a file is missing or malformed, or ``truth`` names no robot of the run.
+    """
+    run = _read_run(out)
+    components = {robot: int(entry["component"]) for robot, entry in run["robots"].items()}
+    trajectories = {robot: read_tum(out / "trajectory" / f"{robot}.tum") for robot in components}
+    everywhere, across = (None, None)
+    if relations is not None:
+        everywhere, across = evaluate_relations(read_relations(relations), trajectories, components)
+    references = {robot: read_tum(path) for robot, path in _by_robot(truth, list(components)).items()}
+    measured = sorted({components[robot] for robot in references})
+    frames = _true_frames(run, references)
+    evaluation = Evaluation(
+        relations=everywhere,
+        relations_across=across,
+        ate=tuple(
+            evaluate_ate(references, {r: t for r, t in trajectories.items() if components[r] == component})
+            for component in measured
+        ),
+        vertices=_vertex_honesty(run, frames) if references else None,
+        edges=_edge_honesty(run, frames) if references else None,
+    )
+    with replacing(out / "evaluation.json") as path:
+        path.write_text(to_json(asdict(evaluation)))
+    return evaluation
+
+
+def _read_run(out: Path) -> dict[str, Any]:
+    path = out / "run.json"
+    try:
+        run = json.loads(path.read_text())
+        return {key: run[key] for key in ("robots", "components", "vertices", "edges")}
+    except OSError as error:
+        raise EvaluationError(f"{path}: cannot be read ({error.strerror}); give the directory a run wrote") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise EvaluationError(f"{path}: not what a run writes ({error}); run again") from error
+
+
+def _name(vertex: list[Any]) -> _Name:
+    robot, index = vertex
+    return str(robot), int(index)
+
+
+def _by_robot(truth: Mapping[str, Path] | Path | None, robots: list[str]) -> Mapping[str, Path]:
+    if truth is None:
+        return {}
+    if isinstance(truth, Path):
+        if len(robots) != 1:
+            names = ", ".join(robots)
+            raise EvaluationError(f"{truth}: one truth for {len(robots)} robots; give one for each of {names}")
+        return {robots[0]: truth}
+    for robot, path in truth.items():
+        if robot not in robots:
+            raise EvaluationError(f"{path}: truth of {robot!r}, but the run has only {', '.join(robots)}")
+    return truth
+
+
+def _true_frames(run: dict[str, Any], references: Mapping[str, TimedPoses]) -> dict[_Name, FloatArray]:
+    """world_T_local of every vertex whose first scan the references know."""
+    frames = {}
+    for vertex in run["vertices"]:
+        robot, first = vertex["id"][0], vertex["first_scan"]
+        if robot not in references or first is None:
+            continue
+        pose, found = interpolate(references[robot], np.array([first["time"]]))
+        if found[0]:
+            frames[_name(vertex["id"])] = se2.compose(pose[0], se2.inverse(np.array(first["pose"])))
+    return frames
+
+
+def _vertex_honesty(run: dict[str, Any], frames: dict[_Name, FloatArray]) -> Honesty:
+    vertices = {_name(vertex["id"]): vertex for vertex in run["vertices"]}
+    true, estimated, covariances = [], [], []
+    for component in run["components"]:
+        root, *others = map(_name, component)
+        for name in others:
+            if root in frames and name in frames and vertices[name]["covariance"] is not None:
+                true.append(se2.between(frames[root], frames[name]))
+                estimated.append(se2.between(np.array(vertices[root]["pose"]), np.array(vertices[name]["pose"])))
+                covariances.append(vertices[name]["covariance"])
+    return _honesty(true, estimated, covariances)
+
+
+def _edge_honesty(run: dict[str, Any], frames: dict[_Name, FloatArray]) -> dict[str, Honesty]:
+    kinds: dict[str, list[tuple[Any, Any, Any]]] = {}
+    for edge in run["edges"]:
+        tail, head = _name(edge["tail"]), _name(edge["head"])
+        if edge["fate"] == "accepted" and tail in frames and head in frames:
+            true = se2.between(frames[tail], frames[head])
+            kinds.setdefault(edge["kind"], []).append((true, edge["measurement"], edge["covariance"]))
+    return {kind: _honesty(*map(list, zip(*rows, strict=True))) for kind, rows in kinds.items()}
+
+
+def _honesty(true: list[Any], estimated: list[Any], covariances: list[Any]) -> Honesty:
+    count = len(true)
+    sample = nees(
+        np.reshape(true, (count, 3)), np.reshape(estimated, (count, 3)), np.reshape(covariances, (count, 3, 3))
+    )
+    return Honesty(Statistics.of(sample), count)

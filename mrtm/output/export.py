@@ -1,0 +1,147 @@
+"""Write everything a run leaves behind."""
+
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from factors import VertexId
+from mrtm.evaluation.se2 import wrap
+from mrtm.joint.fusion import fuse
+from mrtm.output.figures import draw_map
+from mrtm.output.files import replacing, to_json
+from mrtm.output.g2o import write_g2o
+from mrtm.output.local_maps import local_map_name, write_local_map
+from mrtm.output.occupancy import write_occupancy
+from mrtm.result import RunResult, Trajectory
+
+MAP_RESOLUTION = 0.05
+"""Metres per cell of the exported joint grid."""
+
+
+def export(result: RunResult, out: Path) -> None:
+    """Write ``result`` to the directory ``out`` as the design's "What a run leaves behind" has it.
+
+    Every file appears whole or not at all, ``run.json`` last; what an earlier run left and this one has no use for is
+    removed. The same result gives the same bytes, except for the timings in ``run.json``, among which the seconds
+    spent here are entered as ``output``.
+    """
+    started = time.perf_counter()
+    for directory in (out, out / "trajectory", out / "local_maps"):
+        directory.mkdir(parents=True, exist_ok=True)
+    components = by_size(result.components)
+    written: set[Path] = set()
+    with ThreadPoolExecutor(1) as background:  # compression lets go of the interpreter lock
+        pending = []
+        for vertex, local_map in result.local_maps.items():
+            path = out / "local_maps" / local_map_name(vertex)
+            written.add(path)
+            pending.append(background.submit(write_local_map, path, local_map))
+        for robot, trajectory in result.trajectories.items():
+            path = out / "trajectory" / f"{robot}.tum"
+            written.add(path)
+            _write_tum(path, trajectory)
+        write_g2o(out / "graph.g2o", result, components)
+        for number, component in enumerate(components):
+            stem = out / map_stem(number)
+            written |= {stem.with_suffix(suffix) for suffix in (".pgm", ".yaml", ".png")}
+            maps = [(result.vertex_poses[v], result.local_maps[v]) for v in component if v in result.local_maps]
+            write_occupancy(stem, fuse(maps, MAP_RESOLUTION))
+            draw_map(result, component, stem.with_suffix(".png"))
+        for job in pending:
+            job.result()
+    stale = [path for pattern in _PATTERNS for path in out.glob(pattern) if path not in written]
+    for path in (*stale, out / "evaluation.json"):
+        path.unlink(missing_ok=True)
+    result.timings["output"] = time.perf_counter() - started
+    with replacing(out / "run.json") as temporary:
+        temporary.write_text(to_json(run_record(result)))
+
+
+_PATTERNS = ("trajectory/*.tum", "local_maps/*.npz", "map.*", "map-*.pgm", "map-*.yaml", "map-*.png")
+
+
+def map_stem(component: int) -> str:
+    """The name, without suffix, of the map files of a component by size."""
+    return f"map-{component}" if component else "map"
+
+
+def by_size(components: list[list[VertexId]]) -> list[list[VertexId]]:
+    """The components, that of most vertices first."""
+    return sorted(components, key=len, reverse=True)
+
+
+def run_record(result: RunResult) -> dict[str, Any]:
+    """The content of ``run.json``; a vertex is ``[robot, index]``, a pose ``[x, y, theta]``, all else in SI units."""
+    components = by_size(result.components)
+    component_of = {vertex: number for number, component in enumerate(components) for vertex in component}
+    return {
+        "versions": _versions(),
+        "seed": result.seed,
+        "config": result.config,
+        "counts": result.counts,
+        "timings": result.timings,
+        "robots": {
+            robot: {
+                "scans": len(trajectory.times),
+                "duration": float(np.ptp(trajectory.times)) if len(trajectory.times) else 0.0,
+                "component": component_of[VertexId(robot, int(trajectory.vertices[0]))],
+            }
+            for robot, trajectory in result.trajectories.items()
+            if len(trajectory.times)
+        },
+        "components": [[[v.robot, v.index] for v in component] for component in components],
+        "vertices": [_vertex_record(result, vertex, number) for vertex, number in component_of.items()],
+        "edges": [
+            fate.edge.to_dict() | {"fate": fate.fate, "reason": fate.reason, "chi2": fate.chi2} for fate in result.edges
+        ],
+        "events": [
+            {"time": event.time, "robot": event.robot, "kind": event.kind, "detail": event.detail}
+            for event in result.events
+        ],
+        "blemishes": result.blemishes,
+    }
+
+
+def _vertex_record(result: RunResult, vertex: VertexId, component: int) -> dict[str, Any]:
+    local_map = result.local_maps.get(vertex)
+    first = None
+    if local_map is not None and len(local_map.times):
+        first = {"time": local_map.times[0], "pose": local_map.poses[0]}  # local_T_robot
+    return {
+        "id": [vertex.robot, vertex.index],
+        "component": component,
+        "pose": _xytheta(result.vertex_poses[vertex]),
+        "covariance": result.vertex_covariances.get(vertex),
+        "scans": 0 if local_map is None else len(local_map.times),
+        "first_scan": first,
+    }
+
+
+def _xytheta(pose: gtsam.Pose2) -> list[float]:
+    return [pose.x(), pose.y(), pose.theta()]
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": sys.version.split()[0]}
+    for package in ("mrtm", "gtsam", "numpy", "numba"):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:  # run from a checkout that is not installed
+            versions[package] = "not installed"
+    return versions
+
+
+def _write_tum(path: Path, trajectory: Trajectory) -> None:
+    """Lines ``t x y z qx qy qz qw``, in the order of the log."""
+    half = wrap(trajectory.poses[:, 2]) / 2
+    zeros = np.zeros(len(half))
+    columns = [trajectory.times, trajectory.poses[:, :2], zeros, zeros, zeros, np.sin(half), np.cos(half)]
+    line = "%.6f %.9f %.9f %d %d %d %.12f %.12f"
+    with replacing(path) as temporary:
+        temporary.write_text("".join(line % tuple(row) + "\n" for row in np.column_stack(columns).tolist()))

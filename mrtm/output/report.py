@@ -1,0 +1,117 @@
+"""What a run and its evaluation have to say, for the terminal."""
+
+from collections import Counter
+
+import numpy as np
+from rich.console import RenderableType
+from rich.markup import escape
+from rich.table import Table
+
+from mrtm.evaluation import AbsoluteErrors, Evaluation, RelationErrors, Statistics
+from mrtm.result import RunResult
+
+FATES = ("accepted", "replaced", "refused")
+
+
+def run_report(result: RunResult) -> list[RenderableType]:
+    """Scans and speed, components, edges by type and fate, timings by stage, blemishes of the logs.
+
+    ``timings["total"]``, if there, is the whole run; else the stages are added up.
+    """
+    parts: list[RenderableType] = [_speed(result)]
+    for component in sorted(result.components, key=len, reverse=True):
+        robots = ", ".join(dict.fromkeys(vertex.robot for vertex in component))
+        parts.append(f"[bold]{len(component)}[/] vertices in one map: {escape(robots)}")
+    if len(result.components) > 1:
+        parts.append(f"[yellow]{len(result.components)} maps: these robots never came into one[/]")
+    if result.edges:
+        parts.append(_edges(result))
+    if result.timings:
+        parts.append(_timings(result))
+    parts += [f"[yellow]{escape(blemish)}[/]" for blemish in result.blemishes]
+    return parts
+
+
+def evaluation_report(evaluation: Evaluation) -> list[RenderableType]:
+    """A table for each thing measured."""
+    parts: list[RenderableType] = []
+    if evaluation.relations is not None:
+        table = _errors_table("relations")
+        _add_relations(table, "all", evaluation.relations)
+        if evaluation.relations_across is not None:
+            _add_relations(table, "between robots", evaluation.relations_across)
+        parts.append(table)
+    if evaluation.ate:
+        table = _errors_table("trajectory after one alignment")
+        for ate in evaluation.ate:
+            _add_ate(table, ate)
+        parts.append(table)
+    honest = {f"{kind} edges": honesty for kind, honesty in (evaluation.edges or {}).items()}
+    if evaluation.vertices is not None:
+        honest["joint vertex poses"] = evaluation.vertices
+    if honest:
+        table = Table("NEES (1 is honest, above over-confident)")
+        for column in ("mean", "median", "max", "count"):
+            table.add_column(column, justify="right")
+        for name, honesty in honest.items():
+            numbers = [f"{value:.2f}" for value in (honesty.nees.mean, honesty.nees.median, honesty.nees.max)]
+            table.add_row(name.replace("_", " "), *numbers, str(honesty.count))
+        parts.append(table)
+    return parts
+
+
+def _speed(result: RunResult) -> str:
+    scans = sum(len(trajectory.times) for trajectory in result.trajectories.values())
+    logged = sum(float(np.ptp(t.times)) for t in result.trajectories.values() if len(t.times))
+    seconds = _total(result)
+    text = f"[bold]{scans:,}[/] scans over {logged:,.0f} s"
+    return f"{text} in [bold]{seconds:.1f} s[/], {logged / seconds:,.0f} times real time" if seconds > 0 else text
+
+
+def _total(result: RunResult) -> float:
+    return result.timings.get("total", sum(result.timings.values()))
+
+
+def _edges(result: RunResult) -> Table:
+    counts = Counter((str(fate.edge.kind), fate.fate) for fate in result.edges)
+    table = Table("edges")
+    for fate in FATES:
+        table.add_column(fate, justify="right")
+    for kind in dict.fromkeys(kind for kind, _ in counts):
+        table.add_row(kind.replace("_", " "), *(str(counts[kind, fate] or "") for fate in FATES))
+    return table
+
+
+def _timings(result: RunResult) -> Table:
+    table = Table("stage")
+    table.add_column("s", justify="right")
+    table.add_column("%", justify="right")
+    total = _total(result)
+    for stage, seconds in result.timings.items():
+        table.add_row(escape(stage), f"{seconds:.2f}", f"{100 * seconds / total:.0f}" if total > 0 else "")
+    return table
+
+
+def _errors_table(title: str) -> Table:
+    table = Table(title, "")
+    for column in ("mean", "std", "median", "rmse", "max", "count", "left out"):
+        table.add_column(column, justify="right")
+    return table
+
+
+def _add_relations(table: Table, name: str, errors: RelationErrors) -> None:
+    left_out = f"{errors.no_scan} no scan" if errors.no_scan else "0"
+    if errors.unconnected:
+        left_out += f", {errors.unconnected} unconnected"
+    _add_rows(table, name, errors.translation, errors.rotation, errors.count, left_out)
+
+
+def _add_ate(table: Table, errors: AbsoluteErrors) -> None:
+    left_out = f"{errors.no_scan} no scan" if errors.no_scan else "0"
+    _add_rows(table, ", ".join(errors.robots), errors.translation, errors.rotation, errors.count, left_out)
+
+
+def _add_rows(table: Table, name: str, metres: Statistics, degrees: Statistics, count: int, left_out: str) -> None:
+    for label, unit, digits, s in ((escape(name), "m", 4, metres), ("", "deg", 3, degrees)):
+        numbers = [f"{value:.{digits}f}" for value in (s.mean, s.std, s.median, s.rmse, s.max)]
+        table.add_row(label, unit, *numbers, *((str(count), left_out) if label else ("", "")))
