@@ -5,6 +5,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from factors import (
@@ -21,6 +22,8 @@ from factors import (
 )
 from mrtm.joint import smoother
 from mrtm.joint.graph import GraphError, JointGraph
+
+FloatArray = npt.NDArray[np.float64]
 
 STEP_COVARIANCE = np.diag([0.03, 0.02, np.radians(0.3)]) ** 2
 LOOP_COVARIANCE = np.diag([0.02, 0.02, np.radians(0.2)]) ** 2
@@ -319,6 +322,20 @@ def test_innovation_is_chi2_over_honest_worlds() -> None:
     assert np.mean(values) == pytest.approx(3.0, abs=4.0 * np.sqrt(6.0 / 300.0))
 
 
+def test_innovation_far_off_in_heading_is_closed_form(looped: tuple[World, JointGraph]) -> None:
+    world, graph = looped
+    edge = world.edge(70, 8, 1, EdgeKind.LOOP, off=(1.0, -2.0, 1.2))
+    pose, covariance = graph.relative(edge.tail, edge.head)
+
+    def residual(xi: FloatArray) -> FloatArray:
+        return gtsam.Pose2.Logmap(edge.measurement.between(pose.compose(gtsam.Pose2.Expmap(xi))))
+
+    by = np.column_stack([(residual(1e-6 * x) - residual(-1e-6 * x)) / 2e-6 for x in np.eye(3)])
+    away = residual(np.zeros(3))
+    expected = away @ np.linalg.solve(edge.covariance + by @ covariance @ by.T, away)
+    assert graph.innovation(edge) == pytest.approx(float(expected), rel=1e-5)
+
+
 def test_chi2_is_the_squared_whitened_residual(looped: tuple[World, JointGraph]) -> None:
     _, graph = looped
     for edge in graph.edges():
@@ -372,6 +389,16 @@ def test_a_loop_may_be_the_only_hold_of_a_vertex() -> None:
     assert distance(graph.estimates(), batch_optimum(graph, graph.estimates())) < 1e-4
     with pytest.raises(GraphError, match="vertices red:3 would be cut off"):
         graph.update(remove=[EdgeId("red", 2)])
+
+
+def test_two_loops_that_hold_a_vertex_together_are_replaced_at_once() -> None:
+    """Either could wait for the other; both out at the same time would lose the vertex."""
+    world = World(16, 5)
+    holds = [world.edge(50, 0, 4, EdgeKind.LOOP), world.edge(51, 2, 4, EdgeKind.LOOP)]
+    graph = built([*world.chain()[:3], *holds])
+    newer = [world.edge(50, 0, 4, EdgeKind.LOOP, version=1), world.edge(51, 2, 4, EdgeKind.LOOP, version=1)]
+    graph.update(replace=newer)
+    assert distance(graph.estimates(), built(graph.edges()).estimates()) < 1e-4
 
 
 def test_checkpoint_goes_through_json_and_goes_on(looped: tuple[World, JointGraph]) -> None:
