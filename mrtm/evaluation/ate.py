@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from frontend import se2
 from frontend.records import FloatArray
-from mrtm.evaluation import se2
 from mrtm.evaluation.statistics import Statistics
 from mrtm.evaluation.trajectory import MAX_GAP, TimedPoses, interpolate
 

@@ -5,8 +5,8 @@ Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications t
 
 import numpy as np
 
+from frontend import se2
 from frontend.records import FloatArray
-from mrtm.evaluation import se2
 
 
 def nees(true: FloatArray, estimated: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from frontend import se2
 from frontend.records import FloatArray
-from mrtm.evaluation import se2
 from mrtm.evaluation.ate import AbsoluteErrors, evaluate_ate
 from mrtm.evaluation.errors import EvaluationError
 from mrtm.evaluation.nees import nees

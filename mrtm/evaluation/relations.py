@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from frontend import se2
 from frontend.records import FloatArray
-from mrtm.evaluation import se2
 from mrtm.evaluation.statistics import Statistics
 from mrtm.evaluation.trajectory import MAX_GAP, TimedPoses, interpolate, read_rows
 

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from frontend import se2
 from frontend.records import FloatArray
-from mrtm.evaluation import se2
 from mrtm.evaluation.errors import EvaluationError
 
 MAX_GAP = 0.3
 """Seconds: a pose is interpolated only between scans this close to the time asked for (Kuemmerle et al. 2009)."""
 
 COINCIDENT = 1e-3
-"""Seconds: a scan this close to the time asked for answers alone, however far away its neighbour is."""
+"""Seconds: a scan this close to the time asked for will do alone, however far away its neighbour is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +91,19 @@ def interpolate(
     to_before, to_after = times - known[before], known[after] - times
     nearest = np.where(np.abs(to_before) <= np.abs(to_after), before, after)
     coincident = np.abs(times - known[nearest]) <= COINCIDENT
-    inside = (to_before >= 0) & (to_after >= 0)
-    found = coincident | (inside & (np.maximum(to_before, to_after) <= max_gap))
+    between = (np.minimum(to_before, to_after) >= 0) & (np.maximum(to_before, to_after) <= max_gap)
+    found = between | coincident
     span = np.where(after > before, known[after] - known[before], 1.0)
     fraction = (to_before / span).clip(0.0, 1.0)[:, None]
-    moved = se2.compose(poses[before], se2.exp(fraction * se2.log(se2.between(poses[before], poses[after]))))
-    return np.where(found[:, None], np.where(coincident[:, None], poses[nearest], moved), np.nan), found
+    moved = se2.compose(poses[before], _exp(fraction * se2.log(se2.between(poses[before], poses[after]))))
+    return np.where(found[:, None], np.where(between[:, None], moved, poses[nearest]), np.nan), found
+
+
+def _exp(tangent: FloatArray) -> FloatArray:
+    """The poses (n, 3) reached by moving with constant velocities (n, 3) for one unit of time."""
+    half = tangent[:, 2] / 2
+    chord = np.sinc(half / np.pi)  # sin(half) / half
+    x, y = chord * np.cos(half), chord * np.sin(half)
+    return np.column_stack(
+        [x * tangent[:, 0] - y * tangent[:, 1], y * tangent[:, 0] + x * tangent[:, 1], se2.wrap(tangent[:, 2])]
+    )

@@ -3,15 +3,16 @@
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import gtsam
 import numpy as np
 
+import mrtm
 from factors import VertexId
-from mrtm.evaluation.se2 import wrap
+from frontend.se2 import wrap
 from mrtm.joint.fusion import fuse
 from mrtm.output.figures import draw_map
 from mrtm.output.files import replacing, to_json
@@ -128,13 +129,8 @@ def _xytheta(pose: gtsam.Pose2) -> list[float]:
 
 
 def _versions() -> dict[str, str]:
-    versions = {"python": sys.version.split()[0]}
-    for package in ("mrtm", "gtsam", "numpy", "numba"):
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:  # run from a checkout that is not installed
-            versions[package] = "not installed"
-    return versions
+    packages = {package: version(package) for package in ("gtsam", "numpy", "numba")}
+    return {"mrtm": mrtm.__version__, "python": sys.version.split()[0], **packages}
 
 
 def _write_tum(path: Path, trajectory: Trajectory) -> None:
