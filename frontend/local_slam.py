@@ -21,11 +21,13 @@ class Visit:
         poses: (n, 3) local_T_robot at each of its scans.
         covariance: (3, 3) of the last pose, in the robot's tangent frame.
         maps: the vertex's map, a stack of one.
+        since_resampling: key scans since the filter last resampled, of all of the visit's if it did not.
     """
 
     poses: FloatArray
     covariance: FloatArray
     maps: Maps
+    since_resampling: int
 
 
 class LocalSlam:
@@ -39,6 +41,7 @@ class LocalSlam:
         self._offsets: list[FloatArray] = []  # pose seen from that at the key scan before
         self._keys: list[int] = []  # which step of the filter that was
         self._steps = 0
+        self._resampled = 0  # step of the last resampling
         self._base: Maps | None = None
         self._mapping = True
 
@@ -50,7 +53,7 @@ class LocalSlam:
         self._base, self._mapping = known, known is None
         self.filter.start(poses, known)
         self._points, self._increments = [points], [np.zeros(3)]
-        self._offsets, self._keys, self._steps = [np.zeros(3)], [0], 0
+        self._offsets, self._keys, self._steps, self._resampled = [np.zeros(3)], [0], 0, 0
         if self._mapping:
             self.filter.insert(points, poses)
 
@@ -86,7 +89,7 @@ class LocalSlam:
         increments = np.array(self._increments)
         variances = np.array([motion.variance(i, self.parameters.motion) for i in increments])
         poses, maps = refine(self._points, self.path(), increments, variances, self._base, self.parameters)
-        return Visit(poses, covariance, maps)
+        return Visit(poses, covariance, maps, self._steps - self._resampled)
 
     def path(self) -> FloatArray:
         """(n, 3) local_T_robot of the best particle at each scan of the visit so far."""
@@ -98,5 +101,8 @@ class LocalSlam:
         return list(zip(self._points, self._increments, strict=True))
 
     def _update(self, points: Points) -> None:
+        resampled = self.filter.resampled
         self.filter.update(points, self._mapping)
         self._steps += 1
+        if self.filter.resampled > resampled:
+            self._resampled = self._steps

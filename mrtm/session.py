@@ -1,6 +1,7 @@
 """A run: logs in, joint map out."""
 
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from factors import VertexId
 from frontend.grid import UNIT, N, X
 from frontend.local_map import Grid, LocalMap
 from frontend.readers import open_log
+from frontend.records import LaserScan
 from mrtm.config import Config
 from mrtm.joint.graph import JointGraph
 from mrtm.output.export import export
@@ -24,8 +26,16 @@ def run_log(path: Path, out: Path, config: Config, progress: Progress) -> RunRes
     Raises:
         LogError: the log cannot be read or holds no usable scan.
     """
-    started = time.perf_counter()
     log = open_log(path)
+    result = map_scans(log.scans(), config, progress)
+    result.blemishes.append(str(log.report))
+    export(result, out)
+    return result
+
+
+def map_scans(scans: Iterable[LaserScan], config: Config, progress: Progress) -> RunResult:
+    """Map one robot's scans; nothing is written."""
+    started = time.perf_counter()
     graphs: list[JointGraph] = []
     events: list[Event] = []
 
@@ -34,7 +44,7 @@ def run_log(path: Path, out: Path, config: Config, progress: Progress) -> RunRes
         return graphs[-1]
 
     robot = Robot("robot", config, make_joint, events.append)
-    for scan in log.scans():
+    for scan in scans:
         robot.process(scan)
         if len(robot.times) % 100 == 0:
             progress(0.5, f"{len(robot.times)} scans, {len(robot.topology.vertices)} vertices")
@@ -42,13 +52,11 @@ def run_log(path: Path, out: Path, config: Config, progress: Progress) -> RunRes
     graph = graphs[0]
     graph.optimize_fully()
     mapped = time.perf_counter()
-    result = _result(robot, graph, config, events, {"mapping": mapped - started}, [str(log.report)])
-    export(result, out)
-    return result
+    return _result(robot, graph, config, events, {"mapping": mapped - started})
 
 
 def _result(
-    robot: Robot, graph: JointGraph, config: Config, events: list[Event], timings: dict[str, float], blemishes: list[str]
+    robot: Robot, graph: JointGraph, config: Config, events: list[Event], timings: dict[str, float]
 ) -> RunResult:
     topology = robot.topology
     joint = {v.id: graph.estimate(v.id) for v in topology.vertices}
@@ -75,7 +83,7 @@ def _result(
         events=events,
         timings=timings,
         counts={"scans": n, "vertices": len(joint), "edges": len(topology.edges)},
-        blemishes=blemishes,
+        blemishes=[],
     )
 
 

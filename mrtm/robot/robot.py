@@ -95,6 +95,7 @@ class Robot:
         here.maps = visit.maps
         here.scans.extend(range(self._first, self._first + len(visit.poses)))
         here.poses.extend(visit.poses)
+        self._tell("left vertex", vertex=str(here.id), scans=len(visit.poses), since_resampling=visit.since_resampling)
         self._update_edge(UncertainPose(pose_of(visit.poses[0]), visit.covariance))
         return UncertainPose(pose_of(visit.poses[-1]), visit.covariance)
 
@@ -198,7 +199,7 @@ class Robot:
         self._joint.update(add=[edge])
         self._here, self._first = vertex, self._scan if first_scan is None else first_scan
         self._slam.begin(points, np.zeros((self.config.frontend.particles, 3)))
-        self._tell("new vertex", vertex=str(vertex.id))
+        self._tell("new vertex", vertex=str(vertex.id), edge=str(edge))
 
     def _tell(self, kind: str, **detail: Any) -> None:
         self._notify(Event(self.times[-1], self.name, kind, detail))
