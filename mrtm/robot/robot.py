@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 from typing import Any, Protocol
 
+import gtsam
 import numpy as np
 
 from factors import Edge, EdgeKind, UncertainPose, VertexId, compose, intersect, inverse
@@ -116,7 +117,7 @@ class Robot:
         newer = Edge(edge.id, edge.version + 1, kind, edge.tail, edge.head, fused.pose, fused.covariance)
         self.topology.put(newer)
         self._joint.update(replace=[newer])
-        self._tell("edge updated", edge=str(newer), offset=_offset(edge.estimate, measured))
+        self._tell("edge updated", edge=str(newer), **_innovation(edge.estimate, measured))
 
     def _leave(self, points: Points) -> None:
         """The robot has left the 2 d_s square (M4)."""
@@ -180,8 +181,7 @@ class Robot:
         self._here, self._first = vertex, trial.first_scan
         measured = compose(trial.left, inverse(entered))
         edge = self.topology.between(previous.id, vertex.id)
-        expected = compose(trial.left, inverse(trial.candidate.estimate))
-        detail = dict(vertex=str(vertex.id), reason=reason, offset=_offset(expected, measured))
+        detail = {"vertex": str(vertex.id), "reason": reason, **_innovation(trial.candidate.estimate, entered)}
         if edge is None:
             edge = self.topology.new_edge(EdgeKind.LOOP, previous.id, vertex.id, measured)
             self.topology.put(edge)
@@ -205,6 +205,9 @@ class Robot:
         self._notify(Event(self.times[-1], self.name, kind, detail))
 
 
-def _offset(expected: UncertainPose, measured: UncertainPose) -> list[float]:
-    """x, y, theta by which a measurement differs from what was expected."""
-    return [round(float(v), 4) for v in array_of(expected.pose.between(measured.pose))]
+def _innovation(expected: UncertainPose, measured: UncertainPose) -> dict[str, Any]:
+    """``offset`` x, y, theta of a measurement from what was expected, and its ``innovation``: the squared Mahalanobis
+    distance over its 3 degrees of freedom, near 1 on average if both are honest and independent."""
+    offset = gtsam.Pose2.Logmap(expected.pose.between(measured.pose))
+    distance = offset @ np.linalg.solve(expected.covariance + measured.covariance, offset)
+    return {"offset": [round(float(v), 4) for v in offset], "innovation": round(float(distance) / 3.0, 3)}
