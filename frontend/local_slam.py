@@ -10,7 +10,7 @@ from frontend.parameters import FilterParameters
 from frontend.points import Points
 from frontend.rbpf import ParticleFilter, Step
 from frontend.records import FloatArray
-from frontend.refine import refine
+from frontend.refine import draw, refine
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,13 +21,24 @@ class Visit:
         poses: (n, 3) local_T_robot at each of its scans.
         covariance: (3, 3) of the last pose, in the robot's tangent frame.
         maps: the vertex's map, a stack of one.
+        points: the scans.
         since_resampling: key scans since the filter last resampled, of all of the visit's if it did not.
     """
 
     poses: FloatArray
     covariance: FloatArray
     maps: Maps
+    points: list[Points]
     since_resampling: int
+
+    def surroundings(self, distance: float, parameters: FilterParameters) -> Maps | None:
+        """What the last ``distance`` metres of the visit saw, drawn in the frame of its last pose; None if nothing did."""
+        steps = np.hypot(*np.diff(self.poses[:, :2], axis=0).T)
+        first = len(self.poses) - 1 - int(np.searchsorted(np.cumsum(steps[::-1]), distance))
+        first = max(0, first)
+        if distance <= 0.0 or first >= len(self.poses) - 1:
+            return None
+        return draw(self.points[first:-1], se2.between(self.poses[-1], self.poses[first:-1]), parameters)
 
 
 class LocalSlam:
@@ -45,12 +56,14 @@ class LocalSlam:
         self._base: Maps | None = None
         self._mapping = True
 
-    def begin(self, points: Points, poses: FloatArray, known: Maps | None = None) -> None:
+    def begin(self, points: Points, poses: FloatArray, known: Maps | None = None, mapping: bool = True) -> None:
         """Start a visit with its first scan at ``poses`` (particles, 3).
 
-        With a ``known`` map (a stack of one) the particles only localise in it until ``settle``.
+        Args:
+            known: what is known of the place already, a stack of one.
+            mapping: without it the particles only localise in the known map until ``settle``.
         """
-        self._base, self._mapping = known, known is None
+        self._base, self._mapping = known, mapping
         self.filter.start(poses, known)
         self._points, self._increments = [points], [np.zeros(3)]
         self._offsets, self._keys, self._steps, self._resampled = [np.zeros(3)], [0], 0, 0
@@ -85,11 +98,22 @@ class LocalSlam:
             self._update(self._points[-1])
             self._offsets[-1] = np.zeros(3)
             self._keys[-1] = self._steps
-        _, covariance = self.filter.pose_and_covariance()
+        covariance = self.covariance()
         increments = np.array(self._increments)
         variances = np.array([motion.variance(i, self.parameters.motion) for i in increments])
         poses, maps = refine(self._points, self.path(), increments, variances, self._base, self.parameters)
-        return Visit(poses, covariance, maps, self._steps - self._resampled)
+        return Visit(poses, covariance, maps, self._points, self._steps - self._resampled)
+
+    def covariance(self) -> FloatArray:
+        """(3, 3) of the robot's pose in the vertex, in the robot's tangent frame.
+
+        What the particles know, and what they cannot know: the slow bending of the map they all share, which grows with
+        the distance from where the visit began.
+        """
+        mean, covariance = self.filter.pose_and_covariance()
+        distance = float(np.hypot(*(mean - self.filter.start_pose)[:2]))
+        xy, theta = self.parameters.drift_xy**2 * distance, self.parameters.drift_theta**2 * distance
+        return covariance + np.diag([xy, xy, theta])
 
     def path(self) -> FloatArray:
         """(n, 3) local_T_robot of the best particle at each scan of the visit so far."""

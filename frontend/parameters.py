@@ -92,11 +92,11 @@ class FilterParameters(Section):
     particles: Annotated[int, Parameter("", "particles of the filter", paper="40", ge=1, le=10000)] = 40
     resolution: Annotated[float, Parameter("m", "width of a grid cell", ge=0.005, le=1)] = 0.05
     sensing_range: Annotated[float, Parameter("m", "readings beyond this are not mapped (d_s)", paper="10 m", gt=0)] = (
-        20.0
+        25.0
     )
     map_width: Annotated[
         float, Parameter("m", "width of a local map", paper="4 d_s = 40 m in the text, 20 m in the experiments", gt=0)
-    ] = 60.0
+    ] = 70.0
     travel_square: Annotated[
         float, Parameter("m", "a robot that leaves this square around the origin leaves the map", paper="2 d_s", gt=0)
     ] = 20.0
@@ -105,6 +105,9 @@ class FilterParameters(Section):
     key_angle: Annotated[float, Parameter("rad", "or after this turn", gt=0)] = 0.2
     sigma: Annotated[float, Parameter("m", "standard deviation of an endpoint across its wall", gt=0)] = 0.02
     temper: Annotated[
-        float, Parameter("", "weight of a scan's likelihood; below 1 because beams are not independent", gt=0, le=1)
-    ] = 0.1
+        float, Parameter("", "weight of a scan's likelihood; below 1 because beams are not independent", gt=0)
+    ] = 1.0
+    carry: Annotated[float, Parameter("m", "the last stretch of a map that the next new map begins with", paper="0", ge=0)] = 5.0
+    drift_xy: Annotated[float, Parameter("m/sqrt(m)", "position error that all particles share", ge=0)] = 0.015
+    drift_theta: Annotated[float, Parameter("rad/sqrt(m)", "heading error that all particles share", ge=0)] = 0.004
     motion: MotionParameters = field(default_factory=MotionParameters)

@@ -81,7 +81,7 @@ def _propose(log_odds, index, surfels, resolution, hits, priors, variances, temp
         # Endpoints of one scan share the errors of the map: they count as temper * n independent ones.
         posterior = temper * hessian + information
         covariance = np.linalg.inv(posterior)
-        log_weights[p] += temper * log_likelihood - 4.5 * math.log(1.0 + q / 9.0) - 0.5 * math.log(
+        log_weights[p] += 0.05 * log_likelihood - 4.5 * math.log(1.0 + q / 9.0) - 0.5 * math.log(
             np.linalg.det(posterior) / np.linalg.det(information)
         )
         _draw(poses[p], covariance, seed, step, p)
@@ -133,6 +133,7 @@ class ParticleFilter:
         self.resampled = 0
         self.leader = 0
         self.pose = np.zeros(3)
+        self.start_pose = np.zeros(3)
 
     def start(self, poses: FloatArray, known: Maps | None = None) -> None:
         """Begin a local map: M1 and M7a with ``poses`` all zero and nothing known; M3's re-entry with the poses drawn
@@ -148,6 +149,7 @@ class ParticleFilter:
         else:
             self.maps.copy_from(known, np.zeros(count, np.int64))
         self.poses = poses.copy()
+        self.start_pose = poses[0].copy()
         self._log_weights[:] = 0.0
         self._covariances[:] = 0.0
         self._history = [(self.poses.copy(), np.arange(count))]

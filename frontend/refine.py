@@ -126,6 +126,11 @@ def _drawn(base: Maps | None, packed: "_Packed", poses: FloatArray, parameters: 
     return maps
 
 
+def draw(points: list[Points], poses: FloatArray, parameters: FilterParameters) -> Maps:
+    """A map (a stack of one) of scans at known poses (n, 3)."""
+    return _drawn(None, _Packed(points), poses, parameters)
+
+
 class _Packed:
     """Many scans in one piece, as the kernels take them."""
 

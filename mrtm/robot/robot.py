@@ -8,6 +8,7 @@ import numpy as np
 
 from factors import Edge, EdgeKind, UncertainPose, VertexId, compose, intersect, inverse
 from frontend import se2
+from frontend.grid import Maps
 from frontend.local_slam import LocalSlam
 from frontend.points import Points, points_of
 from frontend.records import FloatArray, LaserScan
@@ -54,6 +55,7 @@ class Robot:
         self._joint = make_joint(self._here.id)
         self._entered: tuple[Edge, UncertainPose] | None = None  # edge come by, pose on it at leaving the other vertex
         self._trial: Trial | None = None
+        self._surroundings: Maps | None = None  # what the last stretch before leaving saw, around the leaving pose
         self._scan = -1  # index of the present scan
         self._first = 0  # index of the present visit's first scan
 
@@ -92,6 +94,7 @@ class Robot:
     def _leave_map(self) -> UncertainPose:
         """Close the present vertex's map; the robot's pose in it, with covariance."""
         visit = self._slam.finish()
+        self._surroundings = visit.surroundings(self.config.frontend.carry, self.config.frontend)
         here = self._here
         here.maps = visit.maps
         here.scans.extend(range(self._first, self._first + len(visit.poses)))
@@ -152,13 +155,13 @@ class Robot:
             return False
         particles = spread(poses, scores, self.config.frontend.particles, self._random)
         self._trial = Trial(candidate, left, self._scan)
-        self._slam.begin(points, particles, known)
+        self._slam.begin(points, particles, known, mapping=False)
         return True
 
     def _judge(self, leaving: bool) -> None:
         trial = self._trial
         assert trial is not None
-        _, covariance = self._slam.filter.pose_and_covariance()
+        covariance = self._slam.covariance()
         accepted, reason = trial.verdict(covariance, self.config.topology, leaving)
         if accepted is None:
             return
@@ -198,7 +201,7 @@ class Robot:
         self.topology.put(edge)
         self._joint.update(add=[edge])
         self._here, self._first = vertex, self._scan if first_scan is None else first_scan
-        self._slam.begin(points, np.zeros((self.config.frontend.particles, 3)))
+        self._slam.begin(points, np.zeros((self.config.frontend.particles, 3)), self._surroundings)
         self._tell("new vertex", vertex=str(vertex.id), edge=str(edge))
 
     def _tell(self, kind: str, **detail: Any) -> None:
