@@ -85,6 +85,31 @@ def show_config(config: ConfigFile = None, options: Options = None, preset: Pres
     typer.echo(to_yaml(_load(config, preset, options or [])), nl=False)
 
 
+@app.command()
+def fetch(
+    name: Annotated[str | None, typer.Argument(help="A public log; without one, what there is.")] = None,
+    to: Annotated[Path, typer.Option(metavar="DIR", help="Where the files go.")] = Path("data/cache"),
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print paths and errors only.")] = False,
+) -> None:
+    """Download a public log, or list those there are."""
+    from mrtm.fetch import fetch as download
+    from mrtm.fetch import registry, table
+
+    if name is None:
+        typer.echo(table(), nl=False)
+        return
+    from mrtm.progress import showing
+
+    with showing(quiet) as progress:
+        fetched = list(download(name, to, progress))
+    for file in fetched:
+        how = "as registered" if file.checked else "not in the registry to compare with"
+        typer.echo(file.path if quiet else f"{file.path}: sha256 {file.sha256} ({how})")
+    if not quiet:
+        log = registry()[name]
+        typer.echo(f"licence: {log.licence}; cite: {log.citation}; described at {log.page}")
+
+
 def _summary(evaluation: "Evaluation") -> Iterator[str]:
     """One line a measure: mean, deviation and what was left out."""
     for name, errors in (("relations", evaluation.relations), ("between robots", evaluation.relations_across)):
