@@ -189,11 +189,20 @@ class ParticleFilter:
         return Step(start, fit / max(1, known), known / max(1, len(points.hits)))
 
     def _search(self, points: Points, prior: FloatArray, increment: FloatArray, best: Step) -> Step:
-        """The match is poor: odometry may be wrong. Look around, and if that does not help, far around."""
+        """The match is poor: odometry may be wrong. Look around, and if that does not help, far around.
+
+        A match far from what odometry says must explain so much more of the scan.
+        """
         m = self.leader
         stride = max(1, len(points.hits) // 90)
         moved = float(np.hypot(increment[0], increment[1]))
         turned = abs(float(increment[2]))
+        noise = motion.variance(increment, self.parameters.motion)
+
+        def merit(step: Step) -> float:
+            off = se2.between(prior, step.pose)
+            return step.fit * step.known - DISBELIEF * math.log1p(float(off @ (off / noise)) / 9.0)
+
         for level, (reach_xy, reach_theta) in enumerate(
             ((0.3 + 0.5 * moved, 0.2 + 0.3 * turned), (1.0 + 2.0 * moved, 0.6 + 0.5 * turned)), start=1
         ):
@@ -207,7 +216,7 @@ class ParticleFilter:
             for k in range(found):
                 step = self._match(points, peaks[k].copy(), prior, information * 0.1)
                 step.searched = level
-                if step.fit * step.known > best.fit * best.known + MARGIN[level - 1]:
+                if merit(step) > merit(best) + MARGIN:
                     best = step
             if best.fit >= LOST_FIT:
                 break
@@ -297,7 +306,8 @@ MIN_POINTS = 10  # fewer endpoints than this say nothing
 GOOD_FIT = 0.75  # a match that explains less than this of the known space, or
 GOOD_KNOWN = 0.25  # that has less than this in known space, is searched around
 LOST_FIT = 0.45  # below this also far around
-MARGIN = (0.05, 0.25)  # by how much the search near and far must beat the plain match
+MARGIN = 0.05  # by how much a searched match must beat the plain one
+DISBELIEF = 0.05  # what it costs, in fit, to contradict odometry e times more
 
 
 def _good(step: Step) -> bool:

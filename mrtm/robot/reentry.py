@@ -93,7 +93,8 @@ class Trial:
         """
         if len(self.fits) < p.trial_scans:
             return (False, "left before it was sure") if leaving else (None, "")
-        fit, known = float(np.mean(self.fits)), float(np.mean(self.knowns))
+        # The worse of the whole stretch and its end: a robot that drifts off the old map fits well at first.
+        fit, known = (float(min(np.mean(v), np.mean(v[-p.trial_scans :]))) for v in (self.fits, self.knowns))
         spread = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
         numbers = f"fit {fit:.2f}, known {known:.2f}, spread {spread:.2f} m after {self.distance:.1f} m"
         good = fit >= p.trial_fit and known >= p.trial_known and spread <= p.trial_spread
