@@ -27,6 +27,8 @@ class TopologyParameters(Section):
     omega: Annotated[float, Parameter("", "weight of the new estimate in M5", paper="0.5", ge=0, le=1)] = 0.5
     reach: Annotated[float, Parameter("", "standard deviations a pose may lie outside a square in M6", paper="0", ge=0)] = 2.0
     candidates: Annotated[int, Parameter("", "vertices tried at a re-entry, best first", paper="1", ge=1)] = 3
+    attraction: Annotated[float, Parameter("", "part of its square in which a known vertex draws the robot in", ge=0, le=1)] = 0.5
+    look_distance: Annotated[float, Parameter("m", "way between two looks around for such a vertex", gt=0)] = 2.0
     entry_score: Annotated[float, Parameter("", "least score of the first scan in an old map", gt=0, le=1)] = 0.4
     trial_scans: Annotated[int, Parameter("", "scans on trial in an old map, at least", ge=1)] = 8
     trial_distance: Annotated[float, Parameter("m", "way on trial in an old map, at least; three times that at most", gt=0)] = 2.0

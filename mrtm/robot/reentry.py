@@ -65,6 +65,7 @@ class Trial:
         candidate: the vertex on trial.
         left: the robot's pose in the vertex it came from, at the scan where the trial begins.
         first_scan: index of that scan.
+        resume: the robot had not yet left the vertex it came from; if the trial fails it goes on there.
         fits: for each scan, the fraction of the known space that the old map explains.
         knowns: for each scan, the fraction of the endpoints in known space.
         distance: metres driven so far.
@@ -73,10 +74,10 @@ class Trial:
     candidate: Candidate
     left: UncertainPose
     first_scan: int
+    resume: bool
     fits: list[float] = field(default_factory=list)
     knowns: list[float] = field(default_factory=list)
     distance: float = 0.0
-    _key: FloatArray | None = None
 
     def add(self, step: Step, increment: FloatArray) -> None:
         """Take note of one more scan."""

@@ -57,6 +57,7 @@ class Robot:
         self._trial: Trial | None = None
         self._surroundings: Maps | None = None  # what the last stretch before leaving saw, around the leaving pose
         self._scan = -1  # index of the present scan
+        self._since_look = 0.0  # metres driven since M6 last looked around
         self._first = 0  # index of the present visit's first scan
 
     def process(self, scan: LaserScan) -> None:
@@ -90,6 +91,8 @@ class Robot:
             self._judge(leaving=outside)
         elif outside:
             self._leave(points)
+        else:
+            self._look_around(step.pose, points, increment)
 
     def _leave_map(self) -> UncertainPose:
         """Close the present vertex's map; the robot's pose in it, with covariance."""
@@ -125,12 +128,31 @@ class Robot:
     def _leave(self, points: Points) -> None:
         """The robot has left the 2 d_s square (M4)."""
         left = self._leave_map()
-        for candidate in self._candidates(left)[: self.config.topology.candidates]:
-            if self._enter_on_trial(candidate, left, points):
+        for candidate in self._candidates(left, self._half_width):
+            if (found := self._fits(candidate, points)) is not None:
+                self._enter_on_trial(candidate, left, points, found, resume=False)
                 return
         self._create_vertex(left, points)
 
-    def _candidates(self, left: UncertainPose) -> list[Candidate]:
+    def _look_around(self, pose: FloatArray, points: Points, increment: FloatArray) -> None:
+        """Beyond the paper: M6 before the border is reached, when the robot is deep inside another vertex's square.
+
+        Else a robot whose square ends beyond a known place drives right through it, and maps it a second time.
+        """
+        p = self.config.topology
+        self._since_look += float(np.hypot(increment[0], increment[1]))
+        inner = p.attraction * self._half_width
+        if self._since_look < p.look_distance or np.max(np.abs(pose[:2])) < inner:
+            return
+        self._since_look = 0.0
+        robot = UncertainPose(pose_of(pose), self._slam.covariance())
+        for candidate in self._candidates(robot, inner):
+            if (found := self._fits(candidate, points)) is not None:
+                left = self._leave_map()
+                self._enter_on_trial(candidate, left, points, found, resume=True)
+                return
+
+    def _candidates(self, left: UncertainPose, half_width: float) -> list[Candidate]:
         """M6."""
         p = self.config.topology
         if p.projection == "dijkstra":
@@ -140,23 +162,27 @@ class Robot:
                 return self._joint.relative(self._here.id, vertex)
 
         others = [v for v in self.topology.vertices if v is not self._here]
-        return candidates(left, others, project, self._half_width, p.reach)
+        return candidates(left, others, project, half_width, p.reach)[: p.candidates]
 
-    def _enter_on_trial(self, candidate: Candidate, left: UncertainPose, points: Points) -> bool:
-        """M3 with FL_re-enter: particles where the old map explains the scan, within the projected covariance."""
+    def _fits(self, candidate: Candidate, points: Points) -> tuple[FloatArray, FloatArray] | None:
+        """Poses in the candidate's map that explain the scan, with their scores; None if none does well enough."""
         known = candidate.vertex.maps
         assert known is not None
-        p = self.config.topology
         guess, covariance = array_of(candidate.estimate.pose), candidate.estimate.covariance
         poses, scores = hypotheses(known, points, guess, covariance, self.config.frontend)
-        if not len(scores) or scores[0] < p.entry_score:
-            score = f"{scores[0]:.2f}" if len(scores) else "none"
-            self._tell("re-entry refused", vertex=str(candidate.vertex.id), reason=f"the scan does not fit: score {score}")
-            return False
-        particles = spread(poses, scores, self.config.frontend.particles, self._random)
-        self._trial = Trial(candidate, left, self._scan)
-        self._slam.begin(points, particles, known, mapping=False)
-        return True
+        if len(scores) and scores[0] >= self.config.topology.entry_score:
+            return poses, scores
+        score = f"{scores[0]:.2f}" if len(scores) else "none"
+        self._tell("re-entry refused", vertex=str(candidate.vertex.id), reason=f"the scan does not fit: score {score}")
+        return None
+
+    def _enter_on_trial(
+        self, candidate: Candidate, left: UncertainPose, points: Points, found: tuple[FloatArray, FloatArray], resume: bool
+    ) -> None:
+        """M3 with FL_re-enter: particles where the old map explains the scan, within the projected covariance."""
+        particles = spread(*found, self.config.frontend.particles, self._random)
+        self._trial = Trial(candidate, left, self._scan, resume)
+        self._slam.begin(points, particles, candidate.vertex.maps, mapping=False)
 
     def _judge(self, leaving: bool) -> None:
         trial = self._trial
@@ -174,7 +200,12 @@ class Robot:
             return
         self._tell("re-entry refused", vertex=str(vertex.id), reason=reason)
         scans = self._slam.scans()
-        self._create_vertex(trial.left, scans[0][0], trial.first_scan)
+        if trial.resume:
+            self._first = trial.first_scan
+            poses = np.tile(array_of(trial.left.pose), (self.config.frontend.particles, 1))
+            self._slam.begin(scans[0][0], poses, self._here.maps)
+        else:
+            self._create_vertex(trial.left, scans[0][0], trial.first_scan)
         for points, increment in scans[1:]:
             self._advance(points, increment)
 
