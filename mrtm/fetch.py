@@ -138,7 +138,7 @@ def download(file: RemoteFile, to: Path, progress: Progress = lambda fraction, d
     Raises:
         FetchError: as :func:`fetch`.
     """
-    logging.getLogger("pooch").setLevel(logging.WARNING)  # it would print the sum, and advice for programmers
+    pooch.get_logger().setLevel(logging.WARNING)  # it would print the sum, and advice for programmers
     target = to.absolute() / file.name
     downloader = _Resuming(target, progress)
     known = file.sha256 and f"sha256:{file.sha256}"
@@ -152,7 +152,7 @@ def download(file: RemoteFile, to: Path, progress: Progress = lambda fraction, d
     except requests.RequestException as error:
         raise FetchError(f"{file.url}: {error}") from error
     except OSError as error:
-        raise FetchError(f"{error.filename or target}: cannot be written: {error.strerror}") from error
+        raise FetchError(f"{target}: cannot be written: {error.strerror}") from error
     except ValueError as error:
         raise FetchError(
             f"{file.url}: what came is not the file of the registry, whose sha256 is {file.sha256}; nothing was kept"
