@@ -7,7 +7,7 @@ import numpy as np
 from frontend import motion, se2
 from frontend.grid import Maps
 from frontend.parameters import FilterParameters
-from frontend.points import Points
+from frontend.points import Points, merge
 from frontend.rbpf import ParticleFilter, Step
 from frontend.records import FloatArray
 from frontend.refine import draw, refine
@@ -119,6 +119,12 @@ class LocalSlam:
         """(n, 3) local_T_robot of the best particle at each scan of the visit so far."""
         best = self.filter.paths()[:, self.filter.leader]
         return se2.compose(best[self._keys], np.array(self._offsets))
+
+    def submap(self, count: int) -> Points:
+        """What ``count`` scans, evenly taken from the visit so far, saw together, in the frame of the present pose."""
+        path = self.path()
+        chosen = np.unique(np.linspace(0, len(path) - 1, count).astype(int))
+        return merge([self._points[i] for i in chosen], se2.between(path[-1], path[chosen]))
 
     def scans(self) -> list[tuple[Points, FloatArray]]:
         """The visit's scans with the odometry increments that led to them, to take them elsewhere."""

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from frontend.records import LaserScan
+from frontend.records import FloatArray, LaserScan
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -136,3 +136,14 @@ def points_of(scan: LaserScan, sensing_range: float, max_beams: int) -> Points:
     clear = np.empty((beams, 2), np.float32)
     n, m = _points(scan.ranges, scan.laser.angles, scan.laser.mount, sensing_range, stride, hits, clear)
     return Points(hits[:n].copy(), clear[:m].copy(), scan.laser.mount[:2])
+
+
+def merge(points: list[Points], poses: FloatArray) -> Points:
+    """Several scans as one: ``poses`` (n, 3) of the robot at each, in the frame of the result; only hits are kept."""
+    parts = []
+    for scan, pose in zip(points, poses, strict=True):
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        rotation = np.array([[c, s], [-s, c]], np.float32)
+        xy = scan.hits[:, :2] @ rotation + pose[:2].astype(np.float32)
+        parts.append(np.hstack([xy, scan.hits[:, 2:] @ rotation]))
+    return Points(np.concatenate(parts), np.empty((0, 2), np.float32), points[-1].sensor)

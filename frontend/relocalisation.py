@@ -16,10 +16,10 @@ STEP_XY = 0.15  # metres: half the width that surfels cover around themselves
 STEP_THETA = 0.035  # radians
 MAX_XY = 8.0  # metres and
 MAX_THETA = 0.8  # radians searched at most to each side
-SEARCH_BEAMS = 60
+SEARCH_BEAMS = 120
 APART_XY = 0.10  # metres and
 APART_THETA = 0.05  # radians: hypotheses closer than this are one
-SOFTNESS = 0.03  # difference of two scores that makes one hypothesis e times likelier than the other
+SOFTNESS = 0.06  # difference of two scores that makes one hypothesis e times likelier than the other
 SPREAD = np.array([0.03, 0.03, 0.01])  # of the particles around their hypothesis: metres, metres, radians
 
 

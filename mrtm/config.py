@@ -35,6 +35,7 @@ class TopologyParameters(Section):
     trial_fit: Annotated[float, Parameter("", "of the known space the old map must explain", gt=0, le=1)] = 0.7
     trial_known: Annotated[float, Parameter("", "fraction of a scan that must lie in the old map", gt=0, le=1)] = 0.4
     trial_spread: Annotated[float, Parameter("m", "standard deviation of the pose that is still unambiguous", gt=0)] = 0.15
+    trial_lead: Annotated[float, Parameter("", "by which one place must beat all others", ge=0, le=1)] = 0.05
 
 
 class Config(BaseModel):

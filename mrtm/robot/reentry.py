@@ -69,6 +69,7 @@ class Trial:
         fits: for each scan, the fraction of the known space that the old map explains.
         knowns: for each scan, the fraction of the endpoints in known space.
         distance: metres driven so far.
+        next_check: distance at which the next attempt to confirm it is due.
     """
 
     candidate: Candidate
@@ -78,6 +79,17 @@ class Trial:
     fits: list[float] = field(default_factory=list)
     knowns: list[float] = field(default_factory=list)
     distance: float = 0.0
+    next_check: float = 0.0
+
+    def restart(self) -> None:
+        """Forget the scans so far, which are to be taken again from another start."""
+        self.fits.clear()
+        self.knowns.clear()
+        self.distance = 0.0
+
+    def limit(self, p: TopologyParameters) -> float:
+        """Metres after which there must be a verdict."""
+        return 3.0 * p.trial_distance
 
     def add(self, step: Step, increment: FloatArray) -> None:
         """Take note of one more scan."""
@@ -103,7 +115,7 @@ class Trial:
             return True, numbers
         if fit < p.trial_fit - 0.2:
             return False, f"does not fit the old map: {numbers}"
-        if leaving or self.distance >= 3.0 * p.trial_distance:
+        if leaving or self.distance >= self.limit(p):
             reason = "ambiguous" if spread > p.trial_spread else "does not fit the old map"
             return False, f"{reason}: {numbers}"
         return None, numbers

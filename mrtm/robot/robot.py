@@ -19,6 +19,11 @@ from mrtm.robot.reentry import Candidate, Trial, array_of, candidates, pose_of
 from mrtm.robot.topology import Topology, Vertex
 
 
+SUBMAP_SCANS = 12  # taken together to confirm a re-entry
+APART = 0.25  # metres between two places that are not the same
+CHECK_DISTANCE = 0.5  # metres driven between two attempts to confirm
+
+
 class Joint(Protocol):
     """What the robot needs of the joint map: to tell it about edges, and to ask where a vertex is."""
 
@@ -191,8 +196,15 @@ class Robot:
         accepted, reason = trial.verdict(covariance, self.config.topology, leaving)
         if accepted is None:
             return
-        self._trial = None
         vertex = trial.candidate.vertex
+        if accepted:
+            accepted, why = self._confirm(trial)
+            reason = f"{reason}, {why}"
+            if accepted is None:
+                if not leaving and trial.distance < trial.limit(self.config.topology):
+                    return
+                accepted = False
+        self._trial = None
         if accepted:
             entered = UncertainPose(pose_of(self._slam.path()[0]), covariance)
             self._slam.settle()
@@ -206,8 +218,44 @@ class Robot:
             self._slam.begin(scans[0][0], poses, self._here.maps)
         else:
             self._create_vertex(trial.left, scans[0][0], trial.first_scan)
-        for points, increment in scans[1:]:
+        for self._scan, (points, increment) in enumerate(scans[1:], trial.first_scan + 1):
             self._advance(points, increment)
+
+    def _confirm(self, trial: Trial) -> tuple[bool | None, str]:
+        """Search the whole of the projected covariance again, with all that the trial has seen so far as one scan.
+
+        One scan may fit in many places where a stretch of them fits in one. True: it fits where the particles are. None:
+        it does not, or nearly as well elsewhere; where it clearly fits elsewhere, the trial starts again from there.
+        """
+        p = self.config.topology
+        if trial.distance < trial.next_check:
+            return None, "unconfirmed"
+        trial.next_check = trial.distance + CHECK_DISTANCE
+        path = self._slam.path()
+        driven = pose_of(se2.between(path[0], path[-1]))
+        guess = compose(trial.candidate.estimate, UncertainPose(driven, np.zeros((3, 3))))
+        known = trial.candidate.vertex.maps
+        assert known is not None
+        poses, scores = hypotheses(
+            known, self._slam.submap(SUBMAP_SCANS), array_of(guess.pose), guess.covariance, self.config.frontend
+        )
+        offsets = se2.between(poses[0], poses)
+        elsewhere = scores[np.hypot(offsets[:, 0], offsets[:, 1]) > APART]
+        lead = float(scores[0] - elsewhere[0]) if len(elsewhere) else 1.0
+        off = float(np.hypot(*se2.between(path[-1], poses[0])[:2]))
+        numbers = f"leads by {lead:.2f}, {off:.2f} m off"
+        if lead < p.trial_lead:
+            return None, numbers
+        if off <= 0.5 * APART:
+            return True, numbers
+        scans = self._slam.scans()
+        start = se2.compose(poses[0], se2.between(path[-1], path[0]))
+        particles = spread(start[None], np.zeros(1), self.config.frontend.particles, self._random)
+        self._slam.begin(scans[0][0], particles, known, mapping=False)
+        trial.restart()
+        for points, increment in scans[1:]:
+            trial.add(self._slam.add(points, increment), increment)
+        return None, numbers
 
     def _reenter(self, vertex: Vertex, trial: Trial, entered: UncertainPose, reason: str) -> None:
         """The robot is in a known vertex again; M8 if no edge leads there yet."""
@@ -236,7 +284,7 @@ class Robot:
         self._tell("new vertex", vertex=str(vertex.id), edge=str(edge))
 
     def _tell(self, kind: str, **detail: Any) -> None:
-        self._notify(Event(self.times[-1], self.name, kind, detail))
+        self._notify(Event(self.times[self._scan], self.name, kind, detail))
 
 
 def _innovation(expected: UncertainPose, measured: UncertainPose) -> dict[str, Any]:
