@@ -48,8 +48,9 @@ def parse_yaml(text: str, source: str) -> Any:
 
 
 def shorten(text: str, length: int = 100) -> str:
-    """The text on one line, or its beginning if it is long."""
+    """The text as one printable line, or its beginning if it is long."""
     text = " ".join(text.split())
+    text = "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in text)
     return text if len(text) <= length else f"{text[:length]}..."
 
 
