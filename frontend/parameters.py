@@ -27,7 +27,7 @@ class Parameter:
 
     def complaint(self, value: float) -> str:
         """What is wrong with a value, in words; empty if nothing is."""
-        if not math.isfinite(value):
+        if isinstance(value, float) and not math.isfinite(value):  # an int may be too large to ask
             return "must be finite"
         for bound, holds, words in (
             (self.ge, operator.ge, "at least"),
@@ -107,7 +107,9 @@ class FilterParameters(Section):
     temper: Annotated[
         float, Parameter("", "weight of a scan's likelihood; below 1 because beams are not independent", gt=0)
     ] = 1.0
-    carry: Annotated[float, Parameter("m", "the last stretch of a map that the next new map begins with", paper="0", ge=0)] = 5.0
+    carry: Annotated[
+        float, Parameter("m", "the last stretch of a map that the next new map begins with", paper="0", ge=0)
+    ] = 5.0
     drift_xy: Annotated[float, Parameter("m/sqrt(m)", "position error that all particles share", ge=0)] = 0.015
     drift_theta: Annotated[float, Parameter("rad/sqrt(m)", "heading error that all particles share", ge=0)] = 0.004
     motion: MotionParameters = field(default_factory=MotionParameters)

@@ -77,6 +77,32 @@ def evaluate(
         typer.echo(line)
 
 
+@app.command()
+def info(log: Annotated[Path, typer.Argument(help="A robot's log of any known format.")]) -> None:
+    """Tell what a log holds, without mapping it."""
+    from mrtm.info import describe, log_info
+
+    for line in describe(log_info(log)):
+        typer.echo(line)
+
+
+@app.command()
+def convert(
+    log: Annotated[Path, typer.Argument(help="A robot's log of any known format.")],
+    out: Annotated[Path, typer.Argument(help="The CARMEN log; .gz, .bz2 or .xz at the end compresses it.")],
+) -> None:
+    """Write a log as CARMEN."""
+    from frontend.readers import open_log
+    from frontend.writers import write_carmen
+
+    source = open_log(log)
+    typer.echo(f"{out}: {write_carmen(source.scans(), out)} scans")
+    if source.report.sightings:
+        typer.echo(f"left out: {source.report.sightings} sightings, which CARMEN has no message for")
+    for blemish in source.report.blemishes():
+        typer.echo(blemish)
+
+
 @app.command("config")
 def show_config(config: ConfigFile = None, options: Options = None, preset: Preset = None) -> None:
     """Print every parameter with its unit, meaning and the paper's value; the output is a file for --config."""

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from frontend.parameters import FilterParameters, Parameter, ParameterError, Section, check, parameter_of
 from mrtm.errors import ConfigError
+from mrtm.plain_yaml import parse_yaml, read_yaml, shorten
 
 
 @dataclass(frozen=True)
@@ -94,10 +95,11 @@ def load_config(file: Path | None = None, preset: str | None = None, options: Se
     if file is not None:
         given |= _flatten(_read(file), str(file))
     for option in options:
+        source = f"--set {shorten(option)}"
         key, equals, text = option.partition("=")
         if not equals:
-            raise ConfigError(f"--set {option}: give it as section.key=value, for example frontend.particles=60")
-        given |= _flatten(_nested({key.strip(): _parse(text, f"--set {option}")}), f"--set {option}")
+            raise ConfigError(f"{source}: give it as section.key=value, for example frontend.particles=60")
+        given |= _flatten(_nested({key.strip(): parse_yaml(text, source)}), source)
     try:
         return Config.model_validate(_nested({key: item.value for key, item in given.items()}))
     except ValidationError as error:
@@ -139,10 +141,12 @@ def _flatten(values: Mapping[Any, Any], source: str, prefix: str = "") -> dict[s
         key = f"{prefix}{name}"
         inside = [known for known in _TYPES if known.startswith(f"{key}.")]
         if key not in _TYPES and not inside:
+            key = shorten(key)
             closest = difflib.get_close_matches(key, _TYPES, n=1, cutoff=0.0)[0]
             raise ConfigError(f"{source}: unknown key {key}; did you mean {closest}?")
         if inside and not isinstance(value, Mapping):
-            raise ConfigError(f"{source}: {key} is a section and cannot be {value!r}; set {inside[0]} or another key")
+            found = shorten(repr(value))
+            raise ConfigError(f"{source}: {key} is a section and cannot be {found}; set {inside[0]} or another key")
         if inside:
             flat |= _flatten(value, source, f"{key}.")
         elif isinstance(value, bool) and _TYPES[key] is not bool:
@@ -165,27 +169,12 @@ def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read(file: Path) -> Mapping[Any, Any]:
-    try:
-        values = _parse(file.read_text(encoding="utf-8"), str(file))
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{file}: not a text file in UTF-8") from error
+    values = read_yaml(file)
     if values is None:
         return {}
     if not isinstance(values, Mapping):
         raise ConfigError(f"{file}: holds no sections; `mrtm config` prints what one looks like")
     return values
-
-
-def _parse(text: str, source: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f":{mark.line + 1}" if mark is not None and "\n" in text else ""
-        reason = getattr(error, "problem", None) or "unreadable"
-        raise ConfigError(f"{source}{where}: not YAML: {reason}") from error
 
 
 def _explain(error: ValidationError, given: Mapping[str, _Given]) -> str:
@@ -198,4 +187,4 @@ def _explain(error: ValidationError, given: Mapping[str, _Given]) -> str:
     else:
         key, complaint = ".".join(path), first["msg"].replace("Input should", "must", 1)
     item = given.get(key) or _Given(first.get("input"), "configuration")
-    return f"{item.source}: {key} is {item.value!r}: {complaint}"
+    return f"{item.source}: {key} is {shorten(repr(item.value))}: {complaint}"

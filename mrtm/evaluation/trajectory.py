@@ -33,11 +33,11 @@ def read_tum(path: Path) -> TimedPoses:
         EvaluationError: the file or a line of it cannot be read.
     """
     rows = read_rows(path, "t x y z qx qy qz qw")
-    norm = np.linalg.norm(rows[:, 4:], axis=1)
-    if not np.all(norm > 0):
-        raise EvaluationError(f"{path}: pose {int(np.argmin(norm)) + 1} has a quaternion of length zero")
-    qx, qy, qz, qw = rows[:, 4:].T
-    yaw = np.arctan2(2 * (qw * qz + qx * qy), norm**2 - 2 * (qy**2 + qz**2))
+    largest = np.abs(rows[:, 4:]).max(axis=1)
+    if not np.all(largest > 0):
+        raise EvaluationError(f"{path}: pose {int(np.argmin(largest)) + 1} has a quaternion of length zero")
+    qx, qy, qz, qw = (rows[:, 4:] / largest[:, None]).T  # of any length
+    yaw = np.arctan2(2 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
     return TimedPoses(rows[:, 0], np.column_stack([rows[:, 1:3], yaw]))
 
 

@@ -1,6 +1,7 @@
 """Where the configuration's values come from, and what is said of wrong ones."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -121,3 +122,42 @@ def test_an_unknown_preset_is_named() -> None:
 def test_bounds_hold_without_the_configuration() -> None:
     with pytest.raises(ParameterError, match="particles is 0: must be at least 1"):
         FilterParameters(particles=0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("seed: 2001-99-99", "'2001-99-99' is not a valid timestamp"),
+        (f"seed: {'9' * 5000}", f"'{'9' * 39}... is not a valid int"),
+        (f"seed: 1{'0' * 400}", "seed is 1000"),
+        (f"frontend: {{sigma: 1{'0' * 400}}}", "frontend.sigma is 1000"),
+        ("seed: !!int ''", "'' is not a valid int"),
+        ("seed: !!timestamp now", "'now' is not a valid timestamp"),
+        ("seed: !!python/name:os.system x", "could not determine a constructor"),
+        (f"seed: {'[' * 50000}", "nested deeper than 20"),
+        ("\n".join(" " * depth + "a:" for depth in range(300)), "nested deeper than 20"),
+        (f"seed: {'x' * 10**6}", "longer than 65536 characters"),
+        (f"{'x' * 1000}: 1", f"unknown key {'x' * 100}...; did you mean "),
+        (f"frontend: [{'1, ' * 10000}]", "frontend is a section and cannot be [1, 1,"),
+        (f"frontend: {{particles: [{'1, ' * 10000}]}}", "frontend.particles is [1, 1,"),
+        ("seed: &a [1, *a]", "an alias (*); write out what it means"),
+        ('"a\\nb": 1', "unknown key a b; did you mean "),
+    ],
+)
+def test_a_hostile_file_costs_one_line(tmp_path: Path, text: str, said: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    message = str(caught.value)
+    assert message.startswith(str(path))
+    assert said in message
+    assert "\n" not in message
+    assert len(message) < len(str(path)) + 400
+
+
+def test_a_few_lines_cannot_stand_for_gigabytes(tmp_path: Path) -> None:
+    levels = "abcdefghijklmnopqrst"
+    rows = ["a: &a [x, x, x, x]"]
+    rows += [f"{this}: &{this} [{', '.join([f'*{before}'] * 9)}]" for before, this in pairwise(levels)]
+    with pytest.raises(ConfigError, match="alias"):
+        load_config(written(tmp_path, "\n".join([*rows, "frontend: *t"])))
