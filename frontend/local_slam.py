@@ -10,7 +10,7 @@ from frontend.parameters import FilterParameters
 from frontend.points import Points, merge
 from frontend.rbpf import ParticleFilter, Step
 from frontend.records import FloatArray
-from frontend.refine import draw, refine
+from frontend.refine import refine
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,24 +21,13 @@ class Visit:
         poses: (n, 3) local_T_robot at each of its scans.
         covariance: (3, 3) of the last pose, in the robot's tangent frame.
         maps: the vertex's map, a stack of one.
-        points: the scans.
         since_resampling: key scans since the filter last resampled, of all of the visit's if it did not.
     """
 
     poses: FloatArray
     covariance: FloatArray
     maps: Maps
-    points: list[Points]
     since_resampling: int
-
-    def surroundings(self, distance: float, parameters: FilterParameters) -> Maps | None:
-        """What the last ``distance`` metres of the visit saw, drawn in the frame of its last pose; None if nothing did."""
-        steps = np.hypot(*np.diff(self.poses[:, :2], axis=0).T)
-        first = len(self.poses) - 1 - int(np.searchsorted(np.cumsum(steps[::-1]), distance))
-        first = max(0, first)
-        if distance <= 0.0 or first >= len(self.poses) - 1:
-            return None
-        return draw(self.points[first:-1], se2.between(self.poses[-1], self.poses[first:-1]), parameters)
 
 
 class LocalSlam:
@@ -102,7 +91,7 @@ class LocalSlam:
         increments = np.array(self._increments)
         variances = np.array([motion.variance(i, self.parameters.motion) for i in increments])
         poses, maps = refine(self._points, self.path(), increments, variances, self._base, self.parameters)
-        return Visit(poses, covariance, maps, self._points, self._steps - self._resampled)
+        return Visit(poses, covariance, maps, self._steps - self._resampled)
 
     def covariance(self) -> FloatArray:
         """(3, 3) of the robot's pose in the vertex, in the robot's tangent frame.

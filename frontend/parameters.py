@@ -104,12 +104,9 @@ class FilterParameters(Section):
     key_distance: Annotated[float, Parameter("m", "the filter takes a step after this way", gt=0)] = 0.2
     key_angle: Annotated[float, Parameter("rad", "or after this turn", gt=0)] = 0.2
     sigma: Annotated[float, Parameter("m", "standard deviation of an endpoint across its wall", gt=0)] = 0.02
-    temper: Annotated[
-        float, Parameter("", "weight of a scan's likelihood; below 1 because beams are not independent", gt=0)
-    ] = 1.0
-    carry: Annotated[
-        float, Parameter("m", "the last stretch of a map that the next new map begins with", paper="0", ge=0)
-    ] = 5.0
+    independence: Annotated[
+        float, Parameter("", "part of a scan's endpoints that weigh a particle as if independent", gt=0, le=1)
+    ] = 0.05
     drift_xy: Annotated[float, Parameter("m/sqrt(m)", "position error that all particles share", ge=0)] = 0.015
     drift_theta: Annotated[float, Parameter("rad/sqrt(m)", "heading error that all particles share", ge=0)] = 0.004
     motion: MotionParameters = field(default_factory=MotionParameters)

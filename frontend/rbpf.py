@@ -58,7 +58,7 @@ def _draw(mean, covariance, seed, step, particle):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _propose(log_odds, index, surfels, resolution, hits, priors, variances, temper, sigma, seed, step, poses, log_weights, covariances, fits):  # type: ignore[no-untyped-def]  # fmt: skip
+def _propose(log_odds, index, surfels, resolution, hits, priors, variances, independence, sigma, seed, step, poses, log_weights, covariances, fits):  # type: ignore[no-untyped-def]  # fmt: skip
     """Match, draw and weigh every particle; ``poses`` holds the starts and receives the draws."""
     for p in prange(len(poses)):
         theta = priors[p, 2]
@@ -78,11 +78,13 @@ def _propose(log_odds, index, surfels, resolution, hits, priors, variances, temp
         for i in range(3):
             for j in range(3):
                 q += e[i] * information[i, j] * e[j]
-        # Endpoints of one scan share the errors of the map: they count as temper * n independent ones.
-        posterior = temper * hessian + information
+        posterior = hessian + information
         covariance = np.linalg.inv(posterior)
-        log_weights[p] += 0.05 * log_likelihood - 4.5 * math.log(1.0 + q / 9.0) - 0.5 * math.log(
-            np.linalg.det(posterior) / np.linalg.det(information)
+        # Endpoints of one scan share the errors of the map: in weights they count as fewer independent ones.
+        log_weights[p] += (
+            independence * log_likelihood
+            - 4.5 * math.log(1.0 + q / 9.0)
+            - 0.5 * math.log(np.linalg.det(posterior) / np.linalg.det(information))
         )
         _draw(poses[p], covariance, seed, step, p)
         covariances[p] = covariance
@@ -237,7 +239,7 @@ class ParticleFilter:
             fits = np.empty(count)
             _propose(
                 self.maps.log_odds, self.maps.index, self.maps.surfels, self.maps.resolution, points.hits, priors,
-                self._variances, p.temper, p.sigma, self._seed, self._steps, self.poses, self._log_weights,
+                self._variances, p.independence, p.sigma, self._seed, self._steps, self.poses, self._log_weights,
                 self._covariances, fits,
             )  # fmt: skip
             self.poses[:, 2] = se2.wrap(self.poses[:, 2])

@@ -29,7 +29,16 @@ def _match_all(log_odds, index, surfels, resolution, hits, ends, poses, informat
         first = ends[i - 1] if i else 0
         prior = poses[i].copy()
         fit, near, free, _ = match(
-            log_odds, index, surfels, resolution, hits[first : ends[i]], poses[i], prior, information, sigma, hessians[i]
+            log_odds,
+            index,
+            surfels,
+            resolution,
+            hits[first : ends[i]],
+            poses[i],
+            prior,
+            information,
+            sigma,
+            hessians[i],
         )
         fits[i] = fit / max(1, near + free)
 
@@ -126,11 +135,6 @@ def _drawn(base: Maps | None, packed: "_Packed", poses: FloatArray, parameters: 
     return maps
 
 
-def draw(points: list[Points], poses: FloatArray, parameters: FilterParameters) -> Maps:
-    """A map (a stack of one) of scans at known poses (n, 3)."""
-    return _drawn(None, _Packed(points), poses, parameters)
-
-
 class _Packed:
     """Many scans in one piece, as the kernels take them."""
 
@@ -170,7 +174,6 @@ def refine(
             maps.log_odds[0], maps.index[0], maps.surfels[0], maps.resolution,
             packed.hits, packed.ends, matched, LEASH, parameters.sigma, hessians, np.empty(n),
         )  # fmt: skip
-        hessians *= parameters.temper
         hessians += 1e-3 * np.eye(3)
         smoothed = matched
         for _ in range(2):

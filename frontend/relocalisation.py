@@ -17,6 +17,7 @@ STEP_THETA = 0.035  # radians
 MAX_XY = 8.0  # metres and
 MAX_THETA = 0.8  # radians searched at most to each side
 SEARCH_BEAMS = 120
+PRIOR_WEIGHT = 0.003  # of the squared Mahalanobis distance to the guess, against the fraction of endpoints explained
 APART_XY = 0.10  # metres and
 APART_THETA = 0.05  # radians: hypotheses closer than this are one
 SOFTNESS = 0.06  # difference of two scores that makes one hypothesis e times likelier than the other
@@ -33,7 +34,8 @@ def hypotheses(
         covariance: (3, 3) of the guess in the robot's tangent frame; three standard deviations are searched.
 
     Returns:
-        (k, 3) poses and (k,) scores: endpoints explained less endpoints in free space, as a fraction of all.
+        (k, 3) poses and (k,) scores: endpoints explained less endpoints in free space, as a fraction of all,
+        less a little for the distance from the guess.
     """
     c, s = math.cos(guess[2]), math.sin(guess[2])
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -45,7 +47,17 @@ def hypotheses(
     peaks = np.empty((PEAKS, 3))
     stride = max(1, len(points.hits) // SEARCH_BEAMS)
     found = search(
-        *layers, points.hits, guess, reach_xy, STEP_XY, reach_theta, STEP_THETA, information, stride, peaks, np.empty(PEAKS)
+        *layers,
+        points.hits,
+        guess,
+        reach_xy,
+        STEP_XY,
+        reach_theta,
+        STEP_THETA,
+        information,
+        stride,
+        peaks,
+        np.empty(PEAKS),
     )
     poses, scores = [], []
     for start in peaks[:found]:
@@ -53,7 +65,9 @@ def hypotheses(
         fit, _, free, _ = match(*layers, points.hits, pose, guess, information, parameters.sigma, np.empty((3, 3)))
         pose[2] = se2.wrap(pose[2])
         poses.append(pose)
-        scores.append((fit - free) / max(1, len(points.hits)))
+        offset = pose - guess
+        offset[2] = se2.wrap(offset[2])
+        scores.append((fit - free) / max(1, len(points.hits)) - PRIOR_WEIGHT * float(offset @ information @ offset))
     order = np.argsort(-np.array(scores), kind="stable")
     kept: list[int] = []
     for i in order:

@@ -26,16 +26,27 @@ class TopologyParameters(Section):
         Parameter("", "where M6 takes the pose in a known vertex from: joint estimate or shortest path", "dijkstra"),
     ] = "joint"
     omega: Annotated[float, Parameter("", "weight of the new estimate in M5", paper="0.5", ge=0, le=1)] = 0.5
-    reach: Annotated[float, Parameter("", "standard deviations a pose may lie outside a square in M6", paper="0", ge=0)] = 2.0
+    reach: Annotated[
+        float, Parameter("", "standard deviations a pose may lie outside a square in M6", paper="0", ge=0)
+    ] = 2.0
     candidates: Annotated[int, Parameter("", "vertices tried at a re-entry, best first", paper="1", ge=1)] = 3
-    attraction: Annotated[float, Parameter("", "part of its square in which a known vertex draws the robot in", ge=0, le=1)] = 0.5
+    attraction: Annotated[
+        float, Parameter("", "part of its square in which a known vertex draws the robot in", ge=0, le=1)
+    ] = 0.5
     look_distance: Annotated[float, Parameter("m", "way between two looks around for such a vertex", gt=0)] = 2.0
     entry_score: Annotated[float, Parameter("", "least score of the first scan in an old map", gt=0, le=1)] = 0.4
     trial_scans: Annotated[int, Parameter("", "scans on trial in an old map, at least", ge=1)] = 8
-    trial_distance: Annotated[float, Parameter("m", "way on trial in an old map, at least; three times that at most", gt=0)] = 2.0
+    trial_distance: Annotated[
+        float, Parameter("m", "way on trial in an old map, at least; three times that at most", gt=0)
+    ] = 2.0
     trial_fit: Annotated[float, Parameter("", "of the known space the old map must explain", gt=0, le=1)] = 0.7
-    trial_known: Annotated[float, Parameter("", "fraction of a scan that must lie in the old map", gt=0, le=1)] = 0.4
-    trial_spread: Annotated[float, Parameter("m", "standard deviation of the pose that is still unambiguous", gt=0)] = 0.15
+    trial_known: Annotated[float, Parameter("", "fraction of a scan that must lie in the old map", gt=0, le=1)] = 0.55
+    trial_spread: Annotated[float, Parameter("m", "standard deviation of the pose that is still unambiguous", gt=0)] = (
+        0.15
+    )
+    gate: Annotated[
+        float, Parameter("", "chi2 of a re-entry against the joint map above which it is refused", gt=0)
+    ] = 25.0
     trial_lead: Annotated[float, Parameter("", "by which one place must beat all others", ge=0, le=1)] = 0.05
 
 

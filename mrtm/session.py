@@ -100,4 +100,10 @@ def _local_map(vertex: Vertex, times: np.ndarray) -> LocalMap:
     surfels = maps.surfels[0, 1 : maps.counts[0]]
     order = np.argsort(vertex.scans, kind="stable")
     scans = np.array(vertex.scans, np.int64)[order]
-    return LocalMap(grid, scans, times[scans], np.array(vertex.poses)[order], surfels[surfels[:, N] > 0, X : X + 2].astype(np.float64))
+    return LocalMap(
+        grid,
+        scans,
+        times[scans],
+        np.array(vertex.poses)[order],
+        surfels[surfels[:, N] > 0, X : X + 2].astype(np.float64),
+    )

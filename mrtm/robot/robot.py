@@ -8,7 +8,6 @@ import numpy as np
 
 from factors import Edge, EdgeKind, UncertainPose, VertexId, compose, intersect, inverse
 from frontend import se2
-from frontend.grid import Maps
 from frontend.local_slam import LocalSlam
 from frontend.points import Points, points_of
 from frontend.records import FloatArray, LaserScan
@@ -60,7 +59,6 @@ class Robot:
         self._joint = make_joint(self._here.id)
         self._entered: tuple[Edge, UncertainPose] | None = None  # edge come by, pose on it at leaving the other vertex
         self._trial: Trial | None = None
-        self._surroundings: Maps | None = None  # what the last stretch before leaving saw, around the leaving pose
         self._scan = -1  # index of the present scan
         self._since_look = 0.0  # metres driven since M6 last looked around
         self._first = 0  # index of the present visit's first scan
@@ -102,7 +100,6 @@ class Robot:
     def _leave_map(self) -> UncertainPose:
         """Close the present vertex's map; the robot's pose in it, with covariance."""
         visit = self._slam.finish()
-        self._surroundings = visit.surroundings(self.config.frontend.carry, self.config.frontend)
         here = self._here
         here.maps = visit.maps
         here.scans.extend(range(self._first, self._first + len(visit.poses)))
@@ -124,7 +121,10 @@ class Robot:
             # The edge this visit made (M8): its measurement with the pose as it is known now.
             kind, fused = EdgeKind.LOOP, measured
         else:
-            kind, fused = EdgeKind.COVARIANCE_INTERSECTION, intersect(edge.estimate, measured, self.config.topology.omega)
+            kind, fused = (
+                EdgeKind.COVARIANCE_INTERSECTION,
+                intersect(edge.estimate, measured, self.config.topology.omega),
+            )
         newer = Edge(edge.id, edge.version + 1, kind, edge.tail, edge.head, fused.pose, fused.covariance)
         self.topology.put(newer)
         self._joint.update(replace=[newer])
@@ -163,6 +163,7 @@ class Robot:
         if p.projection == "dijkstra":
             project = self.topology.along_shortest_paths(self._here.id)
         else:
+
             def project(vertex: VertexId) -> UncertainPose:
                 return self._joint.relative(self._here.id, vertex)
 
@@ -182,7 +183,12 @@ class Robot:
         return None
 
     def _enter_on_trial(
-        self, candidate: Candidate, left: UncertainPose, points: Points, found: tuple[FloatArray, FloatArray], resume: bool
+        self,
+        candidate: Candidate,
+        left: UncertainPose,
+        points: Points,
+        found: tuple[FloatArray, FloatArray],
+        resume: bool,
     ) -> None:
         """M3 with FL_re-enter: particles where the old map explains the scan, within the projected covariance."""
         particles = spread(*found, self.config.frontend.particles, self._random)
@@ -205,8 +211,11 @@ class Robot:
                     return
                 accepted = False
         self._trial = None
+        entered = UncertainPose(pose_of(self._slam.path()[0]), covariance)
+        surprise = 3.0 * _innovation(trial.candidate.estimate, entered)["innovation"]
+        if accepted and surprise > self.config.topology.gate:
+            accepted, reason = False, f"contradicts the joint map: chi2 {surprise:.1f}, {reason}"
         if accepted:
-            entered = UncertainPose(pose_of(self._slam.path()[0]), covariance)
             self._slam.settle()
             self._reenter(vertex, trial, entered, reason)
             return
@@ -239,6 +248,8 @@ class Robot:
         poses, scores = hypotheses(
             known, self._slam.submap(SUBMAP_SCANS), array_of(guess.pose), guess.covariance, self.config.frontend
         )
+        if not len(poses):
+            return None, "fits nowhere"
         offsets = se2.between(poses[0], poses)
         elsewhere = scores[np.hypot(offsets[:, 0], offsets[:, 1]) > APART]
         lead = float(scores[0] - elsewhere[0]) if len(elsewhere) else 1.0
@@ -280,7 +291,7 @@ class Robot:
         self.topology.put(edge)
         self._joint.update(add=[edge])
         self._here, self._first = vertex, self._scan if first_scan is None else first_scan
-        self._slam.begin(points, np.zeros((self.config.frontend.particles, 3)), self._surroundings)
+        self._slam.begin(points, np.zeros((self.config.frontend.particles, 3)))
         self._tell("new vertex", vertex=str(vertex.id), edge=str(edge))
 
     def _tell(self, kind: str, **detail: Any) -> None:

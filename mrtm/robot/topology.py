@@ -77,7 +77,9 @@ class Topology:
             around.setdefault(e.tail, []).append((e.head, e.estimate))
             around.setdefault(e.head, []).append((e.tail, inverse(e.estimate)))
         found: dict[VertexId, UncertainPose] = {}
-        queue: list[tuple[float, VertexId, UncertainPose]] = [(0.0, start, UncertainPose(gtsam.Pose2(), np.zeros((3, 3))))]
+        queue: list[tuple[float, VertexId, UncertainPose]] = [
+            (0.0, start, UncertainPose(gtsam.Pose2(), np.zeros((3, 3))))
+        ]
         while queue:
             length, vertex, estimate = heapq.heappop(queue)
             if vertex in found:
