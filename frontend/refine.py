@@ -19,33 +19,29 @@ from frontend.records import FloatArray
 
 ROUNDS = 2  # of drawing the map and matching against it
 LEASH = np.diag([1.0 / 0.05**2, 1.0 / 0.05**2, 1.0 / 0.03**2])  # information that keeps a match near where it starts
+TAIL = 9.0  # squared Mahalanobis distance at which odometry has half its weight
+SMOOTHING_STEPS = 3  # Gauss-Newton steps
 DRAW_DISTANCE = 0.10  # metres or
 DRAW_ANGLE = 0.10  # radians between the scans that the map is drawn from
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _match_all(log_odds, index, surfels, resolution, hits, ends, poses, information, sigma, hessians, fits):  # type: ignore[no-untyped-def]
+def _match_all(log_odds, index, surfels, resolution, hits, ends, poses, information, sigma, hessians):  # type: ignore[no-untyped-def]  # fmt: skip
     for i in prange(len(poses)):
         first = ends[i - 1] if i else 0
+        scan = hits[first : ends[i]]
         prior = poses[i].copy()
-        fit, near, free, _ = match(
-            log_odds,
-            index,
-            surfels,
-            resolution,
-            hits[first : ends[i]],
-            poses[i],
-            prior,
-            information,
-            sigma,
-            hessians[i],
-        )
-        fits[i] = fit / max(1, near + free)
+        match(
+            log_odds, index, surfels, resolution, scan, poses[i], prior, information, sigma, hessians[i]
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
 def _smooth(poses, matched, hessians, motions, variances, out):  # type: ignore[no-untyped-def]
-    """One Gauss-Newton step of the chain: scan matches as unary, odometry as binary factors; block tridiagonal."""
+    """One Gauss-Newton step of the chain: scan matches as unary, odometry as binary factors; block tridiagonal.
+
+    A binary factor has a Cauchy tail, as odometry may lie.
+    """
     n = len(poses)
     diagonal = np.zeros((n, 3, 3))
     upper = np.zeros((n, 3, 3))
@@ -83,7 +79,7 @@ def _smooth(poses, matched, hessians, motions, variances, out):  # type: ignore[
         q = 0.0
         for k in range(3):
             q += e[k] * e[k] / variances[i, k]
-        scale = 1.0 / (1.0 + q / 9.0)
+        scale = 1.0 / (1.0 + q / TAIL)
         for k in range(3):
             w[k, k] = scale / variances[i, k]
         diagonal[i - 1] += a.T @ w @ a
@@ -164,25 +160,36 @@ def refine(
         (n, 3) poses and the map, a stack of one.
     """
     packed = _Packed(points)
-    n = len(points)
     origin = poses[0]
     maps = _drawn(base, packed, poses, parameters)
     for _ in range(ROUNDS):
-        matched = poses.copy()
-        hessians = np.empty((n, 3, 3))
-        _match_all(
-            maps.log_odds[0], maps.index[0], maps.surfels[0], maps.resolution,
-            packed.hits, packed.ends, matched, LEASH, parameters.sigma, hessians, np.empty(n),
-        )  # fmt: skip
-        hessians += 1e-3 * np.eye(3)
-        smoothed = matched
-        for _ in range(2):
-            result = np.empty_like(smoothed)
-            _smooth(smoothed, matched, hessians, increments, variances, result)
-            smoothed = result
-        poses = smoothed
+        matched, hessians = _matches(maps, packed, poses, parameters)
+        poses = _smoothed(matched, hessians, increments, variances)
         if base is None:
             poses = se2.compose(origin, se2.between(poses[0], poses))
         maps = _drawn(base, packed, poses, parameters)
     poses[:, 2] = se2.wrap(poses[:, 2])
     return poses, maps
+
+
+def _matches(
+    maps: Maps, packed: _Packed, poses: FloatArray, parameters: FilterParameters
+) -> tuple[FloatArray, FloatArray]:
+    """Every scan against the map: poses (n, 3) and their informations (n, 3, 3)."""
+    matched, hessians = poses.copy(), np.empty((len(poses), 3, 3))
+    _match_all(
+        maps.log_odds[0], maps.index[0], maps.surfels[0], maps.resolution,
+        packed.hits, packed.ends, matched, LEASH, parameters.sigma, hessians,
+    )  # fmt: skip
+    return matched, hessians
+
+
+def _smoothed(matched: FloatArray, hessians: FloatArray, increments: FloatArray, variances: FloatArray) -> FloatArray:
+    """The chain of poses that best agrees with the matches and with odometry."""
+    informations = hessians + 1e-3 * np.eye(3)
+    poses = matched
+    for _ in range(SMOOTHING_STEPS):
+        result = np.empty_like(poses)
+        _smooth(poses, matched, informations, increments, variances, result)
+        poses = result
+    return poses
