@@ -60,10 +60,11 @@ def read_blocks(path: Path, report: Report) -> Iterator[bytes]:
             yield block
 
 
-def split_lines(blocks: Iterator[bytes], report: Report, *, whole: bool = False) -> Iterator[tuple[int, bytes]]:
-    """Yield (line number from 1, line without its end); lines above ``LONGEST_LINE`` bytes are skipped.
+def split_lines(blocks: Iterator[bytes], report: Report) -> Iterator[tuple[int, bytes]]:
+    """Yield (line number from 1, line without its end).
 
-    With ``whole``, so is a last line that has no end: for formats whose lines do not tell when something is missing.
+    Skipped are lines above ``LONGEST_LINE`` bytes, and a last line that has no end: half a line can look like a whole
+    one that says something else.
     """
     number = 0
     tail = b""
@@ -82,10 +83,8 @@ def split_lines(blocks: Iterator[bytes], report: Report, *, whole: bool = False)
             overlong, tail = True, b""
     if overlong:
         report.skip(number + 1, f"longer than {LONGEST_LINE} bytes")
-    elif tail and whole:
-        report.skip(number + 1, "cut off")
     elif tail:
-        report.skip(number + 1, "cut off: the file ends before the line does")
+        report.skip(number + 1, "cut off")
 
 
 def numbers(text: bytes) -> FloatArray:

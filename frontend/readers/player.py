@@ -44,7 +44,7 @@ def read(blocks: Iterator[bytes], report: Report) -> Iterator[Record]:
     Raises:
         LogError: the bearings change, or there is no position line at all.
     """
-    return assemble(_raw_scans(split_lines(blocks, report, whole=True), report), report)
+    return assemble(_raw_scans(split_lines(blocks, report), report), report)
 
 
 def _raw_scans(lines: Iterator[tuple[int, bytes]], report: Report) -> Iterator[RawScan]:
@@ -119,6 +119,8 @@ def _scan(number: int, time: float, data: bytes) -> RawScan:
     if values.size % 3 or values.size < 6:
         raise Unreadable(f"{values.size} numbers are not a range, a bearing and an intensity for each beam")
     ranges, bearings, intensities = values.reshape(-1, 3).T
+    if not np.all(np.abs(bearings) < 10.0):  # written so that NaN fails
+        raise Unreadable("a bearing is not an angle")
     # The line through all bearings is finer than their three decimals.
     beam = np.arange(len(bearings)) - (len(bearings) - 1) / 2
     step = float(beam @ bearings / (beam @ beam))

@@ -204,7 +204,7 @@ def _masked(ranges: FloatArray, max_range: float, report: Report) -> npt.NDArray
     count = np.count_nonzero(usable)
     report.readings += ranges.size
     report.no_returns += int(np.count_nonzero(far))
-    masked = np.minimum(ranges, FARTHEST_WALL).astype(np.float32)  # 1e300 has no float32
+    masked = np.clip(ranges, 0.0, FARTHEST_WALL).astype(np.float32)  # 1e300 has no float32
     masked[far] = np.inf
     if count < ranges.size:
         report.masked += ranges.size - int(count)
