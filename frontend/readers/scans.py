@@ -162,7 +162,11 @@ def _first_look(scans: Iterator[RawScan]) -> list[RawScan]:
 
 def _mount(first: list[RawScan]) -> FloatArray:
     otherwise = first[0].mount()
-    posed = [(scan.odometry, scan.laser_pose) for scan in first if scan.laser_pose is not None]
+    posed = [
+        (scan.odometry, scan.laser_pose)
+        for scan in first
+        if scan.laser_pose is not None and np.all(np.abs(scan.laser_pose) < FARTHEST_ODOMETRY)  # NaN fails
+    ]
     if not posed:
         return otherwise
     robot = np.array([odometry for odometry, _ in posed])

@@ -147,6 +147,7 @@ def memory_bounded(size: int) -> Iterator[None]:
 
 
 ONES = b"1 " * 60_000
+TRIPLES = b"".join(b"1 %.4f 0 " % (beam / 8000) for beam in range(10_000))
 BOMBS: dict[str, tuple[bytes, Callable[[int], bytes]]] = {
     "half a scan": (b"# CARMEN Logfile\n", lambda number: b"FLASER " + ONES + b"\n"),
     "scans": (b"# CARMEN Logfile\n", lambda number: b"FLASER 60000 %s0 0 0 0 0 %d 1 host 1\n" % (ONES, number)),
@@ -154,7 +155,7 @@ BOMBS: dict[str, tuple[bytes, Callable[[int], bytes]]] = {
     "no line end": (b"# CARMEN Logfile\n", lambda number: b"y" * 120_000),
     "triples": (
         LOGS["Player"][0],
-        lambda number: b"1.0 robot0 7000 laser 00 %d.5 " % number + b"1 0 0 " * 20_000 + b"\n",
+        lambda number: b"1.0 robot0 7000 laser 00 %d.5 " % number + TRIPLES + b"\n",
     ),
     "zeros": (LOGS["MRPT rawlog"][0], lambda number: bytes(120_000)),
     "names": (LOGS["MRPT rawlog"][0], lambda number: b"\x97CObservation" * 2_000),
