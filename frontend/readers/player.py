@@ -120,7 +120,7 @@ def _scan(number: int, time: float, data: bytes) -> RawScan:
         raise Unreadable(f"{values.size} numbers are not a range, a bearing and an intensity for each beam")
     ranges, bearings, intensities = values.reshape(-1, 3).T
     if not np.all(np.abs(bearings) < 10.0):  # written so that NaN fails
-        raise Unreadable("a bearing is not an angle")
+        raise Unreadable("the bearings do not rise in even steps")
     # The line through all bearings is finer than their three decimals.
     beam = np.arange(len(bearings)) - (len(bearings) - 1) / 2
     step = float(beam @ bearings / (beam @ beam))
