@@ -5,7 +5,7 @@ STAMP := .venv/.installed
 DEMO := data/demo
 OUT := out/demo
 
-.PHONY: demo test quick lint bench clean
+.PHONY: demo test quick lint bench fuzz clean
 
 demo: $(STAMP)
 	$(BIN)/mrtm run $(DEMO)/demo.clf.gz --out $(OUT)
@@ -24,6 +24,11 @@ lint: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m tools.benchmark
+
+# 100000 bad inputs for every reader, with a seed of your own: make fuzz SEED=7
+SEED ?= 0
+fuzz: $(STAMP)
+	$(BIN)/python -m tools.fuzz --count 100000 --seed $(SEED)
 
 clean:
 	rm -rf out build .mypy_cache .ruff_cache .pytest_cache .hypothesis *.egg-info

@@ -1,7 +1,7 @@
-"""Robot logs as laser scans.
+"""Robot logs as laser scans and, where the laser knows reflective tags, sightings of other robots.
 
 ``open_log(path)`` recognises compression and format by content. A format is a module of this package with a ``NAME``,
-``sniff(first_lines) -> bool`` and ``read(numbered_lines, report) -> Iterator[LaserScan]``; adding one adds the format.
+``sniff(first_bytes) -> bool`` and ``read(blocks, report) -> Iterator[Record]``; adding one adds the format.
 """
 
 import pkgutil
@@ -13,19 +13,20 @@ from pathlib import Path
 from typing import Protocol, cast
 
 from frontend.errors import LogError
-from frontend.readers.lines import read_blocks, split_lines
+from frontend.readers.lines import read_blocks
 from frontend.readers.report import Report
+from frontend.readers.scans import Record
 from frontend.records import LaserScan
 
-__all__ = ["Log", "Report", "open_log"]
+__all__ = ["Log", "Record", "Report", "open_log"]
 
 
 class _Format(Protocol):
     NAME: str
 
-    def sniff(self, lines: list[bytes]) -> bool: ...
+    def sniff(self, head: bytes) -> bool: ...
 
-    def read(self, lines: Iterator[tuple[int, bytes]], report: Report) -> Iterator[LaserScan]: ...
+    def read(self, blocks: Iterator[bytes], report: Report) -> Iterator[Record]: ...
 
 
 @dataclass(slots=True)
@@ -35,7 +36,7 @@ class Log:
     Attributes:
         path: the file.
         format: the format's name, for example "CARMEN".
-        report: what the latest pass of ``scans`` has met so far.
+        report: what the latest pass has met so far.
     """
 
     path: Path
@@ -46,17 +47,22 @@ class Log:
     def __post_init__(self) -> None:
         self.report = Report(self.path)
 
-    def scans(self) -> Iterator[LaserScan]:
-        """Yield the scans in file order, in memory that does not grow with the log; each call reads it anew.
+    def records(self) -> Iterator[Record]:
+        """Yield scans and sightings in file order, in memory that does not grow with the log; each call reads anew.
+
+        A sighting follows the scan it was made in and has its time.
 
         Raises:
             LogError: the file cannot be read, has no usable scan, or its number of beams changes.
         """
         report = self.report = Report(self.path)
-        lines = split_lines(read_blocks(self.path, report), report)
-        yield from self._reader.read(lines, report)
+        yield from self._reader.read(read_blocks(self.path, report), report)
         if not report.scans:
             raise LogError(f"{self.path}: no usable scan{_why(report)}")
+
+    def scans(self) -> Iterator[LaserScan]:
+        """``records`` without the sightings."""
+        return (record for record in self.records() if isinstance(record, LaserScan))
 
 
 def open_log(path: Path) -> Log:
@@ -74,10 +80,9 @@ def open_log(path: Path) -> Log:
     head = next(blocks, b"")
     if not head:
         raise LogError(f"{path}: {report.damage or 'is empty'}")
-    lines = head.split(b"\n")
     formats = _formats()
     for reader in formats:
-        if reader.sniff(lines):
+        if reader.sniff(head):
             return Log(path, reader.NAME, reader)
     known = ", ".join(reader.NAME for reader in formats)
     raise LogError(f"{path}: not a log of a known format ({known}, plain or compressed with gzip, bzip2 or xz)")
@@ -94,6 +99,6 @@ def _why(report: Report) -> str:
         return f"; {report.damage}"
     if report.skipped_examples:
         line, reason = report.skipped_examples[0]
-        return f"; line {line}: {reason}"
+        return f"; {report.unit} {line}: {reason}"
     found = ", ".join(f"{count} {name}" for name, count in sorted(report.lines.items()))
-    return f" among its lines ({found})" if found else ""
+    return f" among its {report.unit}s ({found})" if found else ""

@@ -13,16 +13,17 @@ A log may hold several lasers. One is read, the best of those met in the first 5
 odometry in its own line before without. A RAWLASER takes its odometry from the ODOM lines, interpolated at its time.
 """
 
-from collections import deque
 from collections.abc import Iterable, Iterator
 from itertools import chain, islice
 
 import numpy as np
 
 from frontend.errors import LogError
+from frontend.readers.lines import Unreadable, numbers, split_lines
 from frontend.readers.report import Report
-from frontend.readers.scans import RawScan, assemble, wrap
-from frontend.records import FloatArray, LaserScan, Odometry
+from frontend.readers.scans import RawScan, Record, assemble, wrap
+from frontend.readers.track import OdometryTrack
+from frontend.records import FloatArray, Odometry
 
 NAME = "CARMEN"
 
@@ -36,7 +37,6 @@ _OTHER_WORDS = {word.encode(): word for word in ("ODOM", "SYNC", "COMMENT", "TRU
 # What a CARMEN log starts with: its logger's header, or a message.
 _STARTS = (b"# message_name", b"# message formats", b"# CARMEN", b"PARAM ", b"ODOM ")
 _LOOK_AHEAD = 500
-_WAITING_AT_MOST = 100
 
 # (degrees from the first to the last beam, degrees a beam) by number of readings, for the old messages, which do not
 # say: what a SICK LMS (CARMEN's own guesses, which give 180 readings the 181 beams' bearings less the last), a
@@ -53,25 +53,22 @@ _FANS = {
 }
 
 
-class _Unreadable(Exception):
-    """A line that cannot be used; the message is the reason."""
+def sniff(head: bytes) -> bool:
+    """Whether the first bytes of a file are a CARMEN log's."""
+    return any(line.startswith(_STARTS) or _first_word(line) in _LASER_WORDS for line in head.split(b"\n"))
 
 
-def sniff(lines: list[bytes]) -> bool:
-    """Whether the first lines of a file are a CARMEN log's."""
-    return any(line.startswith(_STARTS) or _first_word(line) in _LASER_WORDS for line in lines)
-
-
-def read(lines: Iterator[tuple[int, bytes]], report: Report) -> Iterator[LaserScan]:
+def read(blocks: Iterator[bytes], report: Report) -> Iterator[Record]:
     """Yield the scans of the log's laser in file order.
 
     Args:
-        lines: (line number, line).
+        blocks: the file's content.
         report: filled on the way.
 
     Raises:
         LogError: the number of beams or their bearings change, or a RAWLASER has no odometry at all.
     """
+    lines = split_lines(blocks, report)
     ahead = list(islice(lines, _LOOK_AHEAD))
     words = {_first_word(line) for _, line in ahead}
     laser = next((name for word, name in _LASER_WORDS.items() if word in words), "")
@@ -113,33 +110,25 @@ def _messages(
 def _raw_scans(
     messages: Iterable[tuple[int, str, bytes]], parameters: dict[str, float], report: Report
 ) -> Iterator[RawScan]:
-    """Parse the lines; scans without odometry of their own wait for the ODOM line after them."""
-    before: Odometry | None = None
-    waiting: deque[RawScan] = deque()
+    """Parse the lines; scans without odometry of their own take it from the ODOM lines."""
+    track = OdometryTrack()
     homeless = ""
     for number, name, line in messages:
         try:
             if name == "ODOM":
-                after = _odometry(line)
-                while waiting:
-                    yield _placed(waiting.popleft(), before or after, after)
-                before = after
+                yield from track.add(_odometry(line))
             elif not name.startswith("RAWLASER"):
                 yield _scan(number, name, line, parameters)
-            elif before is None:
-                homeless = name
-                raise _Unreadable("no ODOM line before it")
+            elif track.started:
+                yield from track.place(_scan(number, name, line, parameters))
             else:
-                waiting.append(_scan(number, name, line, parameters))
-                if len(waiting) > _WAITING_AT_MOST:
-                    yield _placed(waiting.popleft(), before, before)
-        except _Unreadable as reason:
+                homeless = name
+                raise Unreadable("no ODOM line before it")
+        except Unreadable as reason:
             report.skip(number, f"{name}: {reason}")
-    if before is not None:
-        while waiting:
-            yield _placed(waiting.popleft(), before, before)
-    elif homeless:
+    if homeless and not track.started:
         raise LogError(f"{report.path}: {homeless} needs ODOM lines and the log has none that can be read")
+    yield from track.rest()
 
 
 def _first_word(line: bytes) -> bytes:
@@ -151,12 +140,9 @@ def _numbers(line: bytes) -> tuple[FloatArray, int]:
     """The numbers between the message's name and the host; the last one is the ipc time."""
     parts = line.rsplit(None, 2)
     if len(parts) < 3:
-        raise _Unreadable("too few fields")
+        raise Unreadable("too few fields")
     body = parts[0].split(None, 1)
-    try:
-        values = np.fromstring(body[1], dtype=np.float64, sep=" ") if len(body) > 1 else np.empty(0)
-    except ValueError:
-        raise _Unreadable("a field is not a number") from None
+    values = numbers(body[1]) if len(body) > 1 else np.empty(0)
     return values, values.size
 
 
@@ -165,10 +151,10 @@ def _scan(number: int, name: str, line: bytes, parameters: dict[str, float]) -> 
     old = name in ("FLASER", "RLASER")
     at = 0 if old else 7  # where the number of readings stands
     if size <= at:
-        raise _Unreadable(f"only {size} fields")
+        raise Unreadable(f"only {size} fields")
     told = values[at]
     if not (2 <= told <= size and told == int(told)):
-        raise _Unreadable(f"{told:g} readings in {size} fields")
+        raise Unreadable(f"{told:g} readings in {size} fields")
     beams = int(told)
     tail = values[at + 1 + beams :]
     if old:
@@ -180,7 +166,7 @@ def _scan(number: int, name: str, line: bytes, parameters: dict[str, float]) -> 
         tail = _without_remissions(tail, name, beams, size)
         start, step, declared = float(values[1]), float(values[3]), float(values[4])
         if not (abs(start) < 10.0 and 0.0 < step * beams < 10.0):
-            raise _Unreadable(f"{beams} beams from {start:g} in steps of {step:g} rad")
+            raise Unreadable(f"{beams} beams from {start:g} in steps of {step:g} rad")
     raw = name.startswith("RAWLASER")
     return RawScan(
         laser=name,
@@ -208,26 +194,14 @@ def _without_remissions(tail: FloatArray, name: str, beams: int, size: int) -> F
 
 def _expect(fits: bool, beams: int, size: int) -> None:
     if not fits:
-        raise _Unreadable(f"{size} fields do not fit {beams} readings")
+        raise Unreadable(f"{size} fields do not fit {beams} readings")
 
 
 def _odometry(line: bytes) -> Odometry:
     values, size = _numbers(line)
     if size != 7 or not np.all(np.isfinite(values)):
-        raise _Unreadable("not x y theta tv rv accel ipc_time host logger_time in finite numbers")
+        raise Unreadable("not x y theta tv rv accel ipc_time host logger_time in finite numbers")
     return Odometry(time=float(values[6]), pose=values[:3].copy())
-
-
-def _placed(scan: RawScan, before: Odometry, after: Odometry) -> RawScan:
-    """The scan with odometry at its time between two ODOM lines; without such a time that of the one before."""
-    pose = before.pose.copy()
-    if before.time < scan.time <= after.time:
-        share = (scan.time - before.time) / (after.time - before.time)
-        step = after.pose - before.pose
-        step[2] = wrap(step[2])
-        pose += share * step
-    scan.odometry[:] = pose
-    return scan
 
 
 def _read_parameter(line: bytes, parameters: dict[str, float]) -> None:

@@ -1,4 +1,4 @@
-"""The lines of a file, compressed or not, in memory that does not grow with the file or with a line."""
+"""Bytes and lines of a file, compressed or not, in memory that does not grow with the file or with a line."""
 
 import bz2
 import gzip
@@ -8,15 +8,23 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, cast
 
+import numpy as np
+
 from frontend.errors import LogError
 from frontend.readers.report import Report
+from frontend.records import FloatArray
 
 BLOCK = 1 << 17
-LONGEST_LINE = 1 << 20
+LONGEST_LINE = 1 << 17
 
 # The first bytes say how a file is compressed, whatever it is called.
 _OPENERS: dict[bytes, Callable[..., object]] = {b"\x1f\x8b": gzip.open, b"BZh": bz2.open, b"\xfd7zXZ\x00": lzma.open}
-_DAMAGE = (EOFError, OSError, lzma.LZMAError, zlib.error)
+# MemoryError: the header of an xz file asks for as much as it likes.
+_DAMAGE = (EOFError, MemoryError, OSError, lzma.LZMAError, zlib.error)
+
+
+class Unreadable(Exception):
+    """A line or object that cannot be used; the message is the reason."""
 
 
 def read_blocks(path: Path, report: Report) -> Iterator[bytes]:
@@ -53,7 +61,11 @@ def read_blocks(path: Path, report: Report) -> Iterator[bytes]:
 
 
 def split_lines(blocks: Iterator[bytes], report: Report) -> Iterator[tuple[int, bytes]]:
-    """Yield (line number from 1, line without its end); lines above ``LONGEST_LINE`` bytes are skipped."""
+    """Yield (line number from 1, line without its end).
+
+    Skipped are lines above ``LONGEST_LINE`` bytes, and a last line that has no end: half a line can look like a whole
+    one that says something else.
+    """
     number = 0
     tail = b""
     overlong = False
@@ -72,4 +84,16 @@ def split_lines(blocks: Iterator[bytes], report: Report) -> Iterator[tuple[int, 
     if overlong:
         report.skip(number + 1, f"longer than {LONGEST_LINE} bytes")
     elif tail:
-        yield number + 1, tail
+        report.skip(number + 1, "cut off")
+
+
+def numbers(text: bytes) -> FloatArray:
+    """The numbers of a text, separated by blanks.
+
+    Raises:
+        Unreadable: something in it is not a number.
+    """
+    try:
+        return np.fromstring(text, dtype=np.float64, sep=" ")
+    except ValueError:
+        raise Unreadable("a field is not a number") from None

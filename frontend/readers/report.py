@@ -16,9 +16,11 @@ class Report:
 
     Attributes:
         path: the log.
-        lines: number of lines by message name ("FLASER", "ODOM", "#" for comments, ...), unknown names too.
+        unit: what the log consists of: "line", or "object" where it is binary.
+        lines: number of lines or objects by name ("FLASER", "ODOM", "#" for comments, ...), unknown names too.
         laser: what the scans are of, in words, once the first scan is out ("FLASER, 180 beams ...").
         scans: scans given out.
+        sightings: other robots seen, as given out.
         skipped: lines that could not be used; the first ten are in ``skipped_examples`` as (line number, reason).
         duplicates: scans skipped because they repeat the scan before them.
         backward_steps: times the clock stepped back from one scan to the next.
@@ -31,9 +33,11 @@ class Report:
     """
 
     path: Path
+    unit: str = "line"
     lines: Counter[str] = field(default_factory=Counter)
     laser: str = ""
     scans: int = 0
+    sightings: int = 0
     skipped: int = 0
     skipped_examples: list[tuple[int, str]] = field(default_factory=list)
     duplicates: int = 0
@@ -51,6 +55,10 @@ class Report:
         """Seconds between the least and the greatest time of a scan."""
         return self.last_time - self.first_time
 
+    def place(self, line: int) -> str:
+        """Where in the log: ``path:12``, or ``path: object 12``."""
+        return f"{self.path}:{line}" if self.unit == "line" else f"{self.path}: {self.unit} {line}"
+
     def skip(self, line: int, reason: str) -> None:
         """Count a line that cannot be used and keep the first few reasons."""
         self.skipped += 1
@@ -60,12 +68,14 @@ class Report:
     def count_unknown(self, line: int, word: bytes) -> None:
         """Count a line of a message this project does not read, or skip it if ``word`` is no message's name."""
         name = word.decode("ascii", "replace")
-        if not _NAME.fullmatch(name):
-            self.skip(line, f"{_shown(word)} is not the name of a message")
-        elif name in self.lines or len(self.lines) < NAMES_KEPT:
-            self.lines[name] += 1
+        if _NAME.fullmatch(name):
+            _count(self.lines, name)
         else:
-            self.lines["(others)"] += 1
+            self.skip(line, f"{_shown(word)} is not the name of a message")
+
+    def leave_out(self, laser: bytes) -> None:
+        """Count a scan of a laser that is not read."""
+        _count(self.other_lasers, ascii(laser[:40].decode("latin-1"))[1:-1])
 
     def blemishes(self) -> list[str]:
         """What a user should know of, one line each; empty for a clean log."""
@@ -73,8 +83,8 @@ class Report:
         if self.damage:
             found.append(f"{self.path}: {self.damage}; what came before was used")
         if self.skipped:
-            found.append(f"{self.path}: skipped {_number(self.skipped, 'line')} that could not be used")
-            found += [f"{self.path}:{line}: {reason}" for line, reason in self.skipped_examples]
+            found.append(f"{self.path}: skipped {_number(self.skipped, self.unit)} that could not be used")
+            found += [f"{self.place(line)}: {reason}" for line, reason in self.skipped_examples]
         if self.duplicates:
             found.append(f"{self.path}: skipped {_number(self.duplicates, 'repeated scan')}")
         if self.backward_steps:
@@ -85,6 +95,10 @@ class Report:
         for name, count in sorted(self.other_lasers.items()):
             found.append(f"{self.path}: left out {_number(count, 'scan')} of another laser, {name}")
         return found
+
+
+def _count(names: Counter[str], name: str) -> None:
+    names[name if name in names or len(names) < NAMES_KEPT else "(others)"] += 1
 
 
 def _number(count: int, noun: str) -> str:

@@ -1,4 +1,4 @@
-"""From what one line of a log says to a ``LaserScan``: the checks and rules every format shares."""
+"""From what one line of a log says to a ``LaserScan`` and its sightings: the checks and rules every format shares."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -9,13 +9,18 @@ import numpy.typing as npt
 
 from frontend.errors import LogError
 from frontend.readers.report import Report
-from frontend.records import FloatArray, Laser, LaserScan
+from frontend.readers.tags import find_tags
+from frontend.records import FloatArray, Laser, LaserScan, Sighting
+
+Record = LaserScan | Sighting
 
 # A reading this far is no wall of a building: 81.83 or 81.91 m of a SICK LMS in its 80 m mode, 50 m of many loggers.
 FARTHEST_WALL = 50.0
 # The top codes of a SICK LMS telegram mean "no return"; with 13, 14 and 15 bits in millimetres these are, in metres:
 SICK_NO_RETURN = ((8.18, 8.195), (16.37, 16.385), (32.755, 32.77))
 FARTHEST_ODOMETRY = 1e6
+# More beams are no laser's; what is held back at the start is bounded by this.
+MOST_BEAMS = 1 << 13
 # Scans held back at the start, to learn the mount and the no-return reading from more than one of them.
 FIRST_LOOK = (100, 1000)
 TURN_TO_TELL = 0.2
@@ -37,6 +42,7 @@ class RawScan:
         laser_pose: (3,) pose of the laser in the frame of the odometry, as the line claims; None if it has none.
         mount: gives (3,) robot_T_laser as the log's parameters have it.
         declared_max: range at which the log says the laser ends, metres; None if it does not say.
+        bright: (B,) beams that came back from a reflective tag; None if the laser cannot tell.
     """
 
     laser: str
@@ -49,10 +55,11 @@ class RawScan:
     laser_pose: FloatArray | None
     mount: Callable[[], FloatArray]
     declared_max: float | None
+    bright: npt.NDArray[np.bool_] | None = None
 
 
-def assemble(raw: Iterable[RawScan], report: Report) -> Iterator[LaserScan]:
-    """Turn the raw scans of one laser into laser scans, in file order.
+def assemble(raw: Iterable[RawScan], report: Report) -> Iterator[Record]:
+    """Turn the raw scans of one laser into laser scans, in file order, each followed by the sightings in it.
 
     Skipped and counted: a scan with odometry or time that is not finite, and one that repeats the scan before it.
     The first scans (100, or up to 1000 until the robot has turned by 0.2 rad) are held back to settle two things:
@@ -88,12 +95,12 @@ def assemble(raw: Iterable[RawScan], report: Report) -> Iterator[LaserScan]:
     for scan in chain(first, scans):
         if len(scan.ranges) != beams:
             raise LogError(
-                f"{report.path}:{scan.line}: the scan has {len(scan.ranges)} beams, the ones before {beams}; "
+                f"{report.place(scan.line)}: the scan has {len(scan.ranges)} beams, the ones before {beams}; "
                 "split the log there"
             )
         if abs(scan.start - start) + beams * abs(scan.step - step) > 1e-2:
             raise LogError(
-                f"{report.path}:{scan.line}: the beams go from {scan.start:.4g} in steps of {scan.step:.4g} rad, "
+                f"{report.place(scan.line)}: the beams go from {scan.start:.4g} in steps of {scan.step:.4g} rad, "
                 f"the ones before from {start:.4g} in steps of {step:.4g}; split the log there"
             )
         report.scans += 1
@@ -101,7 +108,12 @@ def assemble(raw: Iterable[RawScan], report: Report) -> Iterator[LaserScan]:
         previous = scan.time
         report.first_time = min(scan.time, report.first_time) if report.scans > 1 else scan.time
         report.last_time = max(scan.time, report.last_time) if report.scans > 1 else scan.time
-        yield LaserScan(scan.time, _masked(scan.ranges, max_range, report), scan.odometry, laser)
+        ranges = _masked(scan.ranges, max_range, report)
+        yield LaserScan(scan.time, ranges, scan.odometry, laser)
+        if scan.bright is not None:
+            for sighting in find_tags(scan.time, ranges, scan.bright, laser):
+                report.sightings += 1
+                yield sighting
 
 
 def wrap(angle: float) -> float:
@@ -112,6 +124,9 @@ def wrap(angle: float) -> float:
 def _usable(raw: Iterable[RawScan], report: Report) -> Iterator[RawScan]:
     previous: RawScan | None = None
     for scan in raw:
+        if len(scan.ranges) > MOST_BEAMS:
+            report.skip(scan.line, f"a scan of {len(scan.ranges)} beams, more than {MOST_BEAMS}")
+            continue
         x, y, theta = scan.odometry.tolist()
         # Written so that NaN fails.
         if not (abs(x) < FARTHEST_ODOMETRY and abs(y) < FARTHEST_ODOMETRY and abs(theta) < FARTHEST_ODOMETRY):
@@ -147,7 +162,11 @@ def _first_look(scans: Iterator[RawScan]) -> list[RawScan]:
 
 def _mount(first: list[RawScan]) -> FloatArray:
     otherwise = first[0].mount()
-    posed = [(scan.odometry, scan.laser_pose) for scan in first if scan.laser_pose is not None]
+    posed = [
+        (scan.odometry, scan.laser_pose)
+        for scan in first
+        if scan.laser_pose is not None and np.all(np.abs(scan.laser_pose) < FARTHEST_ODOMETRY)  # NaN fails
+    ]
     if not posed:
         return otherwise
     robot = np.array([odometry for odometry, _ in posed])
@@ -189,7 +208,7 @@ def _masked(ranges: FloatArray, max_range: float, report: Report) -> npt.NDArray
     count = np.count_nonzero(usable)
     report.readings += ranges.size
     report.no_returns += int(np.count_nonzero(far))
-    masked = ranges.astype(np.float32)
+    masked = np.clip(ranges, 0.0, FARTHEST_WALL).astype(np.float32)  # 1e300 has no float32
     masked[far] = np.inf
     if count < ranges.size:
         report.masked += ranges.size - int(count)

@@ -29,8 +29,10 @@ def new_text(path: Path) -> Iterator[TextIO]:
         ):
             yield text
         os.replace(part, path)
-    except BaseException:
+    except BaseException as error:
         part.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename == str(part):
+            error.filename = str(path)
         raise
 
 

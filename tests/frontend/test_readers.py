@@ -124,8 +124,8 @@ def test_any_lines_end_in_scans_or_one_error(tmp_path: Path, body: list[bytes]) 
     ("content", "said"),
     [
         (b"", "is empty"),
-        (gzip.compress(b""), "is empty"),
-        (gzip.compress(LOG.encode())[:8], "cut off or damaged after 0 bytes"),
+        (gzip.compress(b"", mtime=0), "is empty"),
+        (gzip.compress(LOG.encode(), mtime=0)[:8], "cut off or damaged after 0 bytes"),
         (bytes(range(256)) * 40, "not a log of a known format (CARMEN"),
         (b"time,x,y\n1,2,3\n", "not a log of a known format (CARMEN"),
         (HEADER.encode(), "no usable scan among its lines (1 #)"),
@@ -153,7 +153,7 @@ def test_an_absurdly_long_line_is_skipped(tmp_path: Path, where: str) -> None:
     rows = LOG.encode().splitlines()
     at = {"first": 1, "middle": 20, "last": len(rows)}[where]
     rows.insert(at, b"FLASER 9 " + b"1.0 " * (lines.LONGEST_LINE // 2))
-    log = open_log(written(tmp_path / "log", b"\n".join(rows)))
+    log = open_log(written(tmp_path / "log", b"\n".join(rows) + b"\n"))
     assert len(list(log.scans())) == 40
     assert log.report.skipped_examples == [(at + 1, f"longer than {lines.LONGEST_LINE} bytes")]
 
