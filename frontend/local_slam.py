@@ -12,6 +12,9 @@ from frontend.rbpf import ParticleFilter, Step
 from frontend.records import FloatArray
 from frontend.refine import refine
 
+SOFTNESS = 0.06  # difference of two scores that makes one hypothesis e times likelier than the other
+SPREAD = np.diag([0.03**2, 0.03**2, 0.01**2])  # covariance of the particles around their hypothesis
+
 
 @dataclass(frozen=True, slots=True)
 class Visit:
@@ -20,12 +23,14 @@ class Visit:
     Attributes:
         poses: (n, 3) local_T_robot at each of its scans.
         covariance: (3, 3) of the last pose, in the robot's tangent frame.
+        spread: the part of it that the particles knew of.
         maps: the vertex's map, a stack of one.
         since_resampling: key scans since the filter last resampled, of all of the visit's if it did not.
     """
 
     poses: FloatArray
     covariance: FloatArray
+    spread: FloatArray
     maps: Maps
     since_resampling: int
 
@@ -44,20 +49,40 @@ class LocalSlam:
         self._resampled = 0  # step of the last resampling
         self._base: Maps | None = None
         self._mapping = True
+        self._entrance = np.zeros(3)
+        self._random = np.random.default_rng(seed)
 
-    def begin(self, points: Points, poses: FloatArray, known: Maps | None = None, mapping: bool = True) -> None:
+    def begin(
+        self, points: Points, poses: FloatArray, known: Maps | None = None, *, mapping: bool = True, again: bool = False
+    ) -> None:
         """Start a visit with its first scan at ``poses`` (particles, 3).
 
         Args:
             known: what is known of the place already, a stack of one.
             mapping: without it the particles only localise in the known map until ``settle``.
+            again: the robot has never left; the visit before goes on in this one.
         """
         self._base, self._mapping = known, mapping
+        if not again:
+            self._entrance = poses[0].copy()
         self.filter.start(poses, known)
         self._points, self._increments = [points], [np.zeros(3)]
         self._offsets, self._keys, self._steps, self._resampled = [np.zeros(3)], [0], 0, 0
         if self._mapping:
             self.filter.insert(points, poses)
+
+    def particles(self, pose: FloatArray, covariance: FloatArray) -> FloatArray:
+        """(particles, 3) around ``pose`` (3,), ``covariance`` (3, 3) in its tangent frame; the first is ``pose`` itself."""
+        draws = self._random.multivariate_normal(np.zeros(3), covariance, self.parameters.particles)
+        draws[0] = 0.0
+        return se2.compose(pose, draws)
+
+    def spread(self, poses: FloatArray, scores: FloatArray) -> FloatArray:
+        """(particles, 3) around the hypotheses, more around the better ones (M3: "generate a set of particles")."""
+        weights = np.exp((scores - scores.max()) / SOFTNESS)
+        chosen = self._random.choice(len(poses), self.parameters.particles, p=weights / weights.sum())
+        chosen[0] = 0
+        return se2.compose(poses[chosen], self.particles(np.zeros(3), SPREAD))
 
     def add(self, points: Points, increment: FloatArray) -> Step:
         """Take the next scan, ``increment`` (3,) of odometry after the last one."""
@@ -91,7 +116,8 @@ class LocalSlam:
         increments = np.array(self._increments)
         variances = np.array([motion.variance(i, self.parameters.motion) for i in increments])
         poses, maps = refine(self._points, self.path(), increments, variances, self._base, self.parameters)
-        return Visit(poses, covariance, maps, self._steps - self._resampled)
+        _, spread = self.filter.pose_and_covariance()
+        return Visit(poses, covariance, spread, maps, self._steps - self._resampled)
 
     def covariance(self) -> FloatArray:
         """(3, 3) of the robot's pose in the vertex, in the robot's tangent frame.
@@ -100,7 +126,7 @@ class LocalSlam:
         the distance from where the visit began.
         """
         mean, covariance = self.filter.pose_and_covariance()
-        distance = float(np.hypot(*(mean - self.filter.start_pose)[:2]))
+        distance = float(np.hypot(*(mean - self._entrance)[:2]))
         xy, theta = self.parameters.drift_xy**2 * distance, self.parameters.drift_theta**2 * distance
         return covariance + np.diag([xy, xy, theta])
 
@@ -114,6 +140,11 @@ class LocalSlam:
         path = self.path()
         chosen = np.unique(np.linspace(0, len(path) - 1, count).astype(int))
         return merge([self._points[i] for i in chosen], se2.between(path[-1], path[chosen]))
+
+    @property
+    def length(self) -> int:
+        """Scans of the visit so far."""
+        return len(self._points)
 
     def scans(self) -> list[tuple[Points, FloatArray]]:
         """The visit's scans with the odometry increments that led to them, to take them elsewhere."""

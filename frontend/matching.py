@@ -175,11 +175,11 @@ def match(log_odds, index, surfels, resolution, hits, start, prior, information,
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def search(log_odds, index, surfels, resolution, hits, centre, reach_xy, step_xy, reach_theta, step_theta, information, stride, peaks, scores):  # type: ignore[no-untyped-def]  # fmt: skip
+def search(log_odds, index, surfels, resolution, hits, centre, reach_xy, step_xy, reach_theta, step_theta, information, stride, peaks, scores):  # type: ignore[no-untyped-def]  # noqa: E501  # fmt: skip
     """Correlative search: score all poses of a lattice around ``centre`` and keep the best local ones.
 
-    The score of a pose is the fraction of endpoints near a surfel less that of endpoints in free space, less the prior's
-    squared Mahalanobis distance (``information`` (3, 3), map coordinates) with a Cauchy tail.
+    The score of a pose is the fraction of endpoints near a surfel less that of endpoints in free space, less the
+    prior's squared Mahalanobis distance (``information`` (3, 3), map coordinates) with a Cauchy tail.
 
     Args:
         peaks: (K, 3) out: best poses, best first, no two within two steps of each other.

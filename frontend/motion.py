@@ -9,8 +9,8 @@ from frontend.records import FloatArray
 def variance(motion: FloatArray, noise: MotionParameters) -> FloatArray:
     """Variances (3,) of x, y, theta of one odometry increment ``motion`` (3,), in the robot frame.
 
-    The standard deviations grow with the distance and the turn, as in Thrun, Burgard, Fox, "Probabilistic Robotics", 5.4,
-    kept isotropic in x and y: an unknown mounting of the laser shows as sideways slip in turns.
+    The standard deviations grow with the distance and the turn, as in Thrun, Burgard, Fox, "Probabilistic Robotics",
+    5.4, kept isotropic in x and y: an unknown mounting of the laser shows as sideways slip in turns.
     """
     distance = float(np.hypot(motion[0], motion[1]))
     turn = abs(float(motion[2]))

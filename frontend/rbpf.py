@@ -58,7 +58,7 @@ def _draw(mean, covariance, seed, step, particle):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _propose(log_odds, index, surfels, resolution, hits, priors, variances, independence, sigma, seed, step, poses, log_weights, covariances, fits):  # type: ignore[no-untyped-def]  # fmt: skip
+def _propose(log_odds, index, surfels, resolution, hits, priors, variances, independence, sigma, seed, step, poses, log_weights, covariances, fits):  # type: ignore[no-untyped-def]  # noqa: E501  # fmt: skip
     """Match, draw and weigh every particle; ``poses`` holds the starts and receives the draws."""
     for p in prange(len(poses)):
         theta = priors[p, 2]
@@ -135,7 +135,6 @@ class ParticleFilter:
         self.resampled = 0
         self.leader = 0
         self.pose = np.zeros(3)
-        self.start_pose = np.zeros(3)
 
     def start(self, poses: FloatArray, known: Maps | None = None) -> None:
         """Begin a local map: M1 and M7a with ``poses`` all zero and nothing known; M3's re-entry with the poses drawn
@@ -151,7 +150,6 @@ class ParticleFilter:
         else:
             self.maps.copy_from(known, np.zeros(count, np.int64))
         self.poses = poses.copy()
-        self.start_pose = poses[0].copy()
         self._log_weights[:] = 0.0
         self._covariances[:] = 0.0
         self._history = [(self.poses.copy(), np.arange(count))]

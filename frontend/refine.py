@@ -1,7 +1,7 @@
 """What a finished local map can still give to the poses it was made of.
 
-Inside a vertex a pose is only as good as the filter was at that time, with half a map. Once the map is whole, every scan
-is matched against it again and the matches are tied together by odometry, the map is drawn anew from the better
+Inside a vertex a pose is only as good as the filter was at that time, with half a map. Once the map is whole, every
+scan is matched against it again and the matches are tied together by odometry, the map is drawn anew from the better
 poses, and so on.
 """
 

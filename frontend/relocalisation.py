@@ -20,8 +20,6 @@ SEARCH_BEAMS = 120
 PRIOR_WEIGHT = 0.003  # of the squared Mahalanobis distance to the guess, against the fraction of endpoints explained
 APART_XY = 0.10  # metres and
 APART_THETA = 0.05  # radians: hypotheses closer than this are one
-SOFTNESS = 0.06  # difference of two scores that makes one hypothesis e times likelier than the other
-SPREAD = np.array([0.03, 0.03, 0.01])  # of the particles around their hypothesis: metres, metres, radians
 
 
 def hypotheses(
@@ -75,11 +73,3 @@ def hypotheses(
         if not np.any((np.hypot(offsets[:, 0], offsets[:, 1]) < APART_XY) & (offsets[:, 2] < APART_THETA)):
             kept.append(int(i))
     return np.array(poses).reshape(-1, 3)[kept], np.array(scores)[kept]
-
-
-def spread(poses: FloatArray, scores: FloatArray, count: int, random: np.random.Generator) -> FloatArray:
-    """(count, 3) particles around the hypotheses, more around the better ones (M3: "generate a set of particles")."""
-    weights = np.exp((scores - scores.max()) / SOFTNESS)
-    chosen = random.choice(len(poses), count, p=weights / weights.sum())
-    chosen[0] = 0
-    return se2.compose(poses[chosen], random.normal(size=(count, 3)) * SPREAD)

@@ -33,6 +33,7 @@ class TopologyParameters(Section):
     attraction: Annotated[
         float, Parameter("", "part of its square in which a known vertex draws the robot in", ge=0, le=1)
     ] = 0.5
+    longest_visit: Annotated[int, Parameter("", "scans after which a map is closed and opened again", ge=100)] = 1500
     look_distance: Annotated[float, Parameter("m", "way between two looks around for such a vertex", gt=0)] = 2.0
     entry_score: Annotated[float, Parameter("", "least score of the first scan in an old map", gt=0, le=1)] = 0.4
     trial_scans: Annotated[int, Parameter("", "scans on trial in an old map, at least", ge=1)] = 8

@@ -29,7 +29,7 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True)
 class EdgeFate:
-    """An edge that was ever made: ``fate`` is "accepted", "replaced" (by a newer version) or "refused", with the reason."""
+    """An edge that was ever made: ``fate`` is "accepted", "replaced" (by a newer version) or "refused", and why."""
 
     edge: Edge
     fate: str
@@ -51,8 +51,8 @@ class Event:
 class RunResult:
     """Everything a run knows at its end, in the joint frame of each component's root.
 
-    ``timings`` are seconds by stage, ``counts`` plain numbers (scans, vertices, ...), ``blemishes`` one line each
-    about what the log's reader met. ``components`` lists the vertices of each connected component, root first.
+    ``timings`` are seconds by stage, ``longest`` those of the longest single call, ``counts`` plain numbers
+    (scans, vertices, ...), ``blemishes`` one line each about what the log's reader met. ``components`` lists the vertices of each connected component, root first.
     """
 
     config: dict[str, Any]
@@ -65,5 +65,6 @@ class RunResult:
     edges: list[EdgeFate]
     events: list[Event]
     timings: dict[str, float]
+    longest: dict[str, float]
     counts: dict[str, int]
     blemishes: list[str]

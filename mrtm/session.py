@@ -1,12 +1,12 @@
 """A run: logs in, joint map out."""
 
-import time
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from factors import VertexId
+from frontend import se2
 from frontend.grid import UNIT, N, X
 from frontend.local_map import Grid, LocalMap
 from frontend.readers import open_log
@@ -16,26 +16,30 @@ from mrtm.joint.graph import JointGraph
 from mrtm.output.export import export
 from mrtm.progress import Progress
 from mrtm.result import EdgeFate, Event, RunResult, Trajectory
+from mrtm.robot.poses import array_of
 from mrtm.robot.robot import Robot
 from mrtm.robot.topology import Vertex
+from mrtm.timing import Stages
 
 
 def run_log(path: Path, out: Path, config: Config, progress: Progress) -> RunResult:
     """Map one robot's log and write what a run leaves behind.
 
+    The robot is called as the file is, without its endings.
+
     Raises:
         LogError: the log cannot be read or holds no usable scan.
     """
     log = open_log(path)
-    result = map_scans(log.scans(), config, progress)
-    result.blemishes.append(str(log.report))
+    result = map_scans(log.scans(), config, progress, path.name.split(".")[0])
+    result.blemishes.extend(log.report.blemishes())
     export(result, out)
     return result
 
 
-def map_scans(scans: Iterable[LaserScan], config: Config, progress: Progress) -> RunResult:
+def map_scans(scans: Iterable[LaserScan], config: Config, progress: Progress, name: str = "robot") -> RunResult:
     """Map one robot's scans; nothing is written."""
-    started = time.perf_counter()
+    stages = Stages()
     graphs: list[JointGraph] = []
     events: list[Event] = []
 
@@ -43,31 +47,31 @@ def map_scans(scans: Iterable[LaserScan], config: Config, progress: Progress) ->
         graphs.append(JointGraph(root))
         return graphs[-1]
 
-    robot = Robot("robot", config, make_joint, events.append)
-    for scan in scans:
+    robot = Robot(name, config, make_joint, events.append, stages)
+    source = iter(scans)
+    while True:
+        with stages("reading"):
+            scan = next(source, None)
+        if scan is None:
+            break
         robot.process(scan)
         if len(robot.times) % 100 == 0:
             progress(0.5, f"{len(robot.times)} scans, {len(robot.topology.vertices)} vertices")
     robot.finish()
     graph = graphs[0]
-    graph.optimize_fully()
-    mapped = time.perf_counter()
-    return _result(robot, graph, config, events, {"mapping": mapped - started})
+    with stages("joint map"):
+        graph.optimize_fully()
+    return _result(robot, graph, config, events, stages)
 
 
-def _result(
-    robot: Robot, graph: JointGraph, config: Config, events: list[Event], timings: dict[str, float]
-) -> RunResult:
+def _result(robot: Robot, graph: JointGraph, config: Config, events: list[Event], stages: Stages) -> RunResult:
     topology = robot.topology
     joint = {v.id: graph.estimate(v.id) for v in topology.vertices}
     n = len(robot.times)
     poses, inside = np.zeros((n, 3)), np.zeros(n, np.int64)
     for vertex in topology.vertices:
-        from frontend import se2
-
-        pose = joint[vertex.id]
         scans = np.array(vertex.scans, np.int64)
-        poses[scans] = se2.compose(np.array([pose.x(), pose.y(), pose.theta()]), np.array(vertex.poses).reshape(-1, 3))
+        poses[scans] = se2.compose(array_of(joint[vertex.id]), np.array(vertex.poses).reshape(-1, 3))
         inside[scans] = vertex.id.index
     times = np.array(robot.times)
     edges = topology.past + [EdgeFate(e, "accepted", chi2=graph.chi2(e.id)) for e in topology.edges.values()]
@@ -81,7 +85,8 @@ def _result(
         components=[[v.id for v in topology.vertices]],
         edges=edges,
         events=events,
-        timings=timings,
+        timings=stages.seconds,
+        longest=stages.longest,
         counts={"scans": n, "vertices": len(joint), "edges": len(topology.edges)},
         blemishes=[],
     )

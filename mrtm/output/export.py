@@ -29,7 +29,7 @@ def export(result: RunResult, out: Path) -> None:
     """Write ``result`` to the directory ``out`` as the design's "What a run leaves behind" has it.
 
     Every file appears whole or not at all, ``run.json`` last; what an earlier run left and this one has no use for is
-    removed. The same result gives the same bytes, except for the timings in ``run.json``, among which the seconds
+    removed. The same result gives the same bytes, except for ``timings`` and ``longest`` in ``run.json``, among which the seconds
     spent here are entered as ``output``.
     """
     started = time.perf_counter()
@@ -87,6 +87,7 @@ def run_record(result: RunResult) -> dict[str, Any]:
         "config": result.config,
         "counts": result.counts,
         "timings": result.timings,
+        "longest": result.longest,
         "robots": {
             robot: {
                 "scans": len(trajectory.times),

@@ -5,18 +5,27 @@ stays as it is, until a stretch of driving has shown that the map explains what 
 agree. Only then does the vertex count as re-entered; else the trial is undone.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import gtsam
 import numpy as np
 
-from factors import UncertainPose, VertexId, compose
+from factors import UncertainPose, VertexId, compose, inverse
 from frontend import se2
+from frontend.grid import Maps
+from frontend.local_slam import SPREAD, LocalSlam
 from frontend.rbpf import Step
 from frontend.records import FloatArray
+from frontend.relocalisation import hypotheses
 from mrtm.config import TopologyParameters
+from mrtm.robot.poses import array_of, exactly, innovation, pose_of
 from mrtm.robot.topology import Vertex
+
+SUBMAP_SCANS = 12  # taken together to confirm a re-entry
+APART = 0.25  # metres between two places that are not the same
+CHECK_DISTANCE = 0.5  # metres driven between two attempts to confirm
+LIMIT = 3.0  # trial distances after which there must be a verdict
+HOPELESS = 0.2  # a fit so far below what is asked for ends the trial at once
+TURN_RADIUS = 0.3  # metres
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,9 +35,16 @@ class Candidate:
     vertex: Vertex
     estimate: UncertainPose
 
+    @property
+    def maps(self) -> Maps:
+        """What is known of the vertex, a stack of one."""
+        maps = self.vertex.maps
+        assert maps is not None  # only the vertex the robot is in for the first time has none
+        return maps
+
 
 def candidates(
-    robot: UncertainPose, vertices: list[Vertex], seen_from_here: Callable[[VertexId], UncertainPose],
+    robot: UncertainPose, vertices: list[Vertex], seen: dict[VertexId, UncertainPose],
     half_width: float, reach: float,
 ) -> list[Candidate]:  # fmt: skip
     """M6: project the robot's pose into every vertex; those where it lies inside the travel square, best first.
@@ -38,23 +54,18 @@ def candidates(
 
     Args:
         robot: pose in the vertex it leaves.
-        seen_from_here: projection to another vertex: here_T_vertex.
+        seen: here_T_vertex of every vertex.
         half_width: of the travel square, metres.
     """
     found = []
     for vertex in vertices:
-        here_T_vertex = seen_from_here(vertex.id)
-        vertex_T_robot = compose(_inverse(here_T_vertex), robot)
+        here_T_vertex = seen[vertex.id]
+        vertex_T_robot = compose(inverse(here_T_vertex), robot)
         pose = vertex_T_robot.pose
         deviation = np.sqrt(np.linalg.eigvalsh(vertex_T_robot.covariance[:2, :2])[1])
         if max(abs(pose.x()), abs(pose.y())) <= half_width + min(reach * deviation, 0.5 * half_width):
             found.append(Candidate(vertex, vertex_T_robot))
     return sorted(found, key=lambda c: float(np.linalg.det(c.estimate.covariance)))
-
-
-def _inverse(a_T_b: UncertainPose) -> UncertainPose:
-    adjoint = a_T_b.pose.AdjointMap()
-    return UncertainPose(a_T_b.pose.inverse(), adjoint @ a_T_b.covariance @ adjoint.T)
 
 
 @dataclass(slots=True)
@@ -68,7 +79,7 @@ class Trial:
         resume: the robot had not yet left the vertex it came from; if the trial fails it goes on there.
         fits: for each scan, the fraction of the known space that the old map explains.
         knowns: for each scan, the fraction of the endpoints in known space.
-        distance: metres driven so far.
+        distance: metres driven so far; a turn counts as if driven on an arc of TURN_RADIUS.
         next_check: distance at which the next attempt to confirm it is due.
     """
 
@@ -81,51 +92,75 @@ class Trial:
     distance: float = 0.0
     next_check: float = 0.0
 
-    def restart(self) -> None:
-        """Forget the scans so far, which are to be taken again from another start."""
-        self.fits.clear()
-        self.knowns.clear()
-        self.distance = 0.0
-
-    def limit(self, p: TopologyParameters) -> float:
-        """Metres after which there must be a verdict."""
-        return 3.0 * p.trial_distance
-
     def add(self, step: Step, increment: FloatArray) -> None:
         """Take note of one more scan."""
         self.fits.append(step.fit)
         self.knowns.append(step.known)
-        self.distance += float(np.hypot(increment[0], increment[1])) + 0.3 * abs(float(increment[2]))
+        self.distance += float(np.hypot(increment[0], increment[1])) + TURN_RADIUS * abs(float(increment[2]))
 
-    def verdict(self, covariance: FloatArray, p: TopologyParameters, leaving: bool) -> tuple[bool | None, str]:
+    def verdict(self, slam: LocalSlam, p: TopologyParameters, leaving: bool) -> tuple[bool | None, str]:
         """Accept (True), refuse (False) or wait (None), and the reason in words.
 
         Args:
-            covariance: (3, 3) of the robot's pose in the old map.
+            slam: localising in the old map. Where the stretch so far fits another place, it starts again from there.
             leaving: the robot is about to leave the vertex: decide now.
         """
         if len(self.fits) < p.trial_scans:
             return (False, "left before it was sure") if leaving else (None, "")
         # The worse of the whole stretch and its end: a robot that drifts off the old map fits well at first.
         fit, known = (float(min(np.mean(v), np.mean(v[-p.trial_scans :]))) for v in (self.fits, self.knowns))
-        spread = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
-        numbers = f"fit {fit:.2f}, known {known:.2f}, spread {spread:.2f} m after {self.distance:.1f} m"
-        good = fit >= p.trial_fit and known >= p.trial_known and spread <= p.trial_spread
-        if good and self.distance >= p.trial_distance:
-            return True, numbers
-        if fit < p.trial_fit - 0.2:
-            return False, f"does not fit the old map: {numbers}"
-        if leaving or self.distance >= self.limit(p):
-            reason = "ambiguous" if spread > p.trial_spread else "does not fit the old map"
-            return False, f"{reason}: {numbers}"
-        return None, numbers
+        covariance = slam.covariance()
+        deviation = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[1]))
+        reason = f"fit {fit:.2f}, known {known:.2f}, spread {deviation:.2f} m after {self.distance:.1f} m"
+        last = leaving or self.distance >= LIMIT * p.trial_distance
+        if fit < p.trial_fit - HOPELESS:
+            return False, f"does not fit the old map: {reason}"
+        if self.distance < p.trial_distance or fit < p.trial_fit or known < p.trial_known or deviation > p.trial_spread:
+            return (False, f"not sure enough: {reason}") if last else (None, reason)
+        if self.distance < self.next_check and not last:
+            return None, reason
+        self.next_check = self.distance + CHECK_DISTANCE
+        confirmed, numbers = self._confirm(slam, p)
+        reason = f"{reason}, {numbers}"
+        if not confirmed:
+            return (False, f"may be elsewhere: {reason}") if last else (None, reason)
+        _, surprise = innovation(self.candidate.estimate, self.entered(slam))
+        if surprise > p.gate:
+            return False, f"contradicts the joint map: chi2 {surprise:.0f}, {reason}"
+        return True, reason
 
+    def entered(self, slam: LocalSlam) -> UncertainPose:
+        """The robot's pose in the old vertex at the scan where the trial began."""
+        return UncertainPose(pose_of(slam.path()[0]), slam.covariance())
 
-def pose_of(xytheta: FloatArray) -> gtsam.Pose2:
-    """The (3,) array as a pose."""
-    return gtsam.Pose2(float(xytheta[0]), float(xytheta[1]), float(se2.wrap(xytheta[2])))
+    def _confirm(self, slam: LocalSlam, p: TopologyParameters) -> tuple[bool, str]:
+        """Search the whole of the projected covariance again, with all that the trial has seen so far as one scan.
 
+        One scan may fit in many places where a stretch of them fits in one. False: it does not fit where the particles
+        are, or nearly as well elsewhere; where it clearly fits elsewhere, the trial starts again from there.
+        """
+        path = slam.path()
+        guess = compose(self.candidate.estimate, exactly(se2.between(path[0], path[-1])))
+        known = self.candidate.maps
+        poses, scores = hypotheses(
+            known, slam.submap(SUBMAP_SCANS), array_of(guess.pose), guess.covariance, slam.parameters
+        )
+        if not len(poses):
+            return False, "fits nowhere"
+        offsets = se2.between(poses[0], poses)
+        elsewhere = scores[np.hypot(offsets[:, 0], offsets[:, 1]) > APART]
+        lead = float(scores[0] - elsewhere[0]) if len(elsewhere) else 1.0
+        off = float(np.hypot(*se2.between(path[-1], poses[0])[:2]))
+        if lead >= p.trial_lead and off > 0.5 * APART:
+            self._restart(slam, se2.compose(poses[0], se2.between(path[-1], path[0])))
+        return lead >= p.trial_lead and off <= 0.5 * APART, f"leads by {lead:.2f}, {off:.2f} m off"
 
-def array_of(pose: gtsam.Pose2) -> FloatArray:
-    """The pose as a (3,) array."""
-    return np.array([pose.x(), pose.y(), pose.theta()])
+    def _restart(self, slam: LocalSlam, start: FloatArray) -> None:
+        """Take the scans so far again, the first of them at ``start``."""
+        scans = slam.scans()
+        slam.begin(scans[0][0], slam.particles(start, SPREAD), self.candidate.maps, mapping=False)
+        self.fits.clear()
+        self.knowns.clear()
+        self.distance = 0.0
+        for points, increment in scans[1:]:
+            self.add(slam.add(points, increment), increment)

@@ -1,7 +1,6 @@
 """The topological map of one robot: vertices with their local maps, and the edges between them."""
 
 import heapq
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import gtsam
@@ -20,12 +19,14 @@ class Vertex:
     Attributes:
         id: name.
         maps: what is known of the place (a stack of one), as the last visit left it; None during the first visit.
+        spread: (3, 3) covariance of the particles when the robot last left.
         scans: indices of the robot's scans taken here, in the order they came.
         poses: local_T_robot (3,) at each of them.
     """
 
     id: VertexId
     maps: Maps | None = None
+    spread: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     scans: list[int] = field(default_factory=list)
     poses: list[FloatArray] = field(default_factory=list)
 
@@ -67,8 +68,8 @@ class Topology:
         """The edge that joins two vertices, in either direction."""
         return next((e for e in self.edges.values() if {e.tail, e.head} == {a, b}), None)
 
-    def along_shortest_paths(self, start: VertexId) -> Callable[[VertexId], UncertainPose]:
-        """start_T_vertex along Dijkstra's shortest path, covariances accumulated along it (M6a).
+    def along_shortest_paths(self, start: VertexId) -> dict[VertexId, UncertainPose]:
+        """start_T_vertex of every vertex along Dijkstra's shortest path, covariances accumulated along it (M6a).
 
         The paper does not say what is short; here it is the distance driven, the sum of the edges' lengths.
         """
@@ -89,4 +90,4 @@ class Topology:
                 if neighbour not in found:
                     distance = length + float(np.hypot(step.pose.x(), step.pose.y()))
                     heapq.heappush(queue, (distance, neighbour, compose(estimate, step)))
-        return found.__getitem__
+        return found

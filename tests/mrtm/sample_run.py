@@ -89,6 +89,7 @@ def sample_run(seed: int = 3) -> RunResult:
         edges=edges,
         events=[Event(100.0, "red", "new vertex", {"vertex": 0})],
         timings={"front end": 1.0, "total": 2.0},
+        longest={"front end": 0.1},
         counts={"scans": 50, "vertices": 5},
         blemishes=["red.clf:12: unreadable"],
     )
