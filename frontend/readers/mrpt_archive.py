@@ -110,7 +110,9 @@ class Archive:
 
     def array(self, kind: str, count: int) -> FloatArray:
         """(count,) numbers; ``kind`` is "f4", "f8" or "i4"."""
-        return np.frombuffer(self.take(count * int(kind[1])), dtype="<" + kind).astype(np.float64)
+        values = np.frombuffer(self.take(count * int(kind[1])), dtype="<" + kind)
+        with np.errstate(invalid="ignore"):  # a signalling NaN
+            return values.astype(np.float64)
 
     def text(self) -> bytes:
         """A string."""
