@@ -25,7 +25,10 @@ LARGEST_MATRIX = 1 << 10
 _LONGEST_NAME = 120
 _NAME = re.compile(rb"(?:mrpt::\w+::)?(C[A-Z]\w*|nullptr)", re.ASCII)
 # What a log's objects are called, with what comes before a name: enough to find the next one in bytes unknown.
-_HEADER = re.compile(rb"(?:([\x80-\xf8])|([\x01-\x78])\0\0\0)(?=(?:mrpt::obs::)?C(?:Observation|Action|SensoryFrame))")
+_HEADER = re.compile(
+    rb"(?:([\x80-\xf8])|([\x01-\x78])\0\0\0)(?=((?:mrpt::obs::)?C(?:Observation|Action|SensoryFrame)\w{0,80}))",
+    re.ASCII,
+)
 
 
 class EndOfArchive(Exception):
@@ -79,21 +82,16 @@ class Archive:
         """Leave an object that cannot be read: search for the next header; whether there is one."""
         self._at = self._start = self._start + 1
         while True:
-            found = _HEADER.search(self._data, self._at)
-            if found is None:
-                # The last bytes may be the beginning of a header.
-                self._at = self._start = max(self._at, len(self._data) - _LONGEST_NAME)
-                if not self._filled(len(self._data) - self._at + 1):
-                    return False
-                continue
-            self._at = self._start = found.start()
-            before = len(found[0])
-            length = (found[1] or found[2])[0] & 0x7F
-            if self._filled(before + length):
-                name = self._data[self._at + before : self._at + before + length]
-                if _NAME.fullmatch(name):
+            rest = max(self._at, len(self._data) - _LONGEST_NAME)  # may be the beginning of a header
+            for found in _HEADER.finditer(self._data, self._at):
+                if found.end(3) == len(self._data):
+                    rest = found.start()
+                elif len(found[3]) == (found[1] or found[2])[0] & 0x7F:
+                    self._at = self._start = found.start()
                     return True
-            self._at = self._start = self._at + 1
+            self._at = self._start = rest
+            if not self._filled(len(self._data) - self._at + 1):
+                return False
 
     def take(self, count: int) -> bytes:
         """The next bytes."""
@@ -112,7 +110,9 @@ class Archive:
 
     def array(self, kind: str, count: int) -> FloatArray:
         """(count,) numbers; ``kind`` is "f4", "f8" or "i4"."""
-        return np.frombuffer(self.take(count * int(kind[1])), dtype="<" + kind).astype(np.float64)
+        values = np.frombuffer(self.take(count * int(kind[1])), dtype="<" + kind)
+        with np.errstate(invalid="ignore"):  # a signalling NaN
+            return values.astype(np.float64)
 
     def text(self) -> bytes:
         """A string."""

@@ -1,6 +1,5 @@
 """Evaluate what a run left behind in its output directory."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from mrtm.evaluation.ate import AbsoluteErrors, evaluate_ate
 from mrtm.evaluation.errors import EvaluationError
 from mrtm.evaluation.nees import nees
 from mrtm.evaluation.relations import RelationErrors, evaluate_relations, read_relations
+from mrtm.evaluation.run_file import RunFile, read_run
 from mrtm.evaluation.statistics import Statistics
 from mrtm.evaluation.trajectory import TimedPoses, interpolate, read_tum
 from mrtm.output.files import replacing, to_json
@@ -61,8 +61,8 @@ def evaluate_output(
     Raises:
         EvaluationError: a file is missing or malformed, or ``truth`` names no robot of the run.
     """
-    run = _read_run(out)
-    components = {robot: int(entry["component"]) for robot, entry in run["robots"].items()}
+    run = read_run(out)
+    components = {robot: entry["component"] for robot, entry in run["robots"].items()}
     trajectories = {robot: read_tum(out / "trajectory" / f"{robot}.tum") for robot in components}
     everywhere, across = (None, None)
     if relations is not None:
@@ -85,22 +85,6 @@ def evaluate_output(
     return evaluation
 
 
-def _read_run(out: Path) -> dict[str, Any]:
-    path = out / "run.json"
-    try:
-        run = json.loads(path.read_text())
-        return {key: run[key] for key in ("robots", "components", "vertices", "edges")}
-    except OSError as error:
-        raise EvaluationError(f"{path}: cannot be read ({error.strerror}); give the directory a run wrote") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise EvaluationError(f"{path}: not what a run writes ({error}); run again") from error
-
-
-def _name(vertex: list[Any]) -> _Name:
-    robot, index = vertex
-    return str(robot), int(index)
-
-
 def _by_robot(truth: Mapping[str, Path] | Path | None, robots: list[str]) -> Mapping[str, Path]:
     if truth is None:
         return {}
@@ -115,7 +99,7 @@ def _by_robot(truth: Mapping[str, Path] | Path | None, robots: list[str]) -> Map
     return truth
 
 
-def _true_frames(run: dict[str, Any], references: Mapping[str, TimedPoses]) -> dict[_Name, FloatArray]:
+def _true_frames(run: RunFile, references: Mapping[str, TimedPoses]) -> dict[_Name, FloatArray]:
     """world_T_local of every vertex whose first scan the references know."""
     frames = {}
     for vertex in run["vertices"]:
@@ -124,15 +108,15 @@ def _true_frames(run: dict[str, Any], references: Mapping[str, TimedPoses]) -> d
             continue
         pose, found = interpolate(references[robot], np.array([first["time"]]))
         if found[0]:
-            frames[_name(vertex["id"])] = se2.compose(pose[0], se2.inverse(np.array(first["pose"])))
+            frames[vertex["id"]] = se2.compose(pose[0], se2.inverse(np.array(first["pose"])))
     return frames
 
 
-def _vertex_honesty(run: dict[str, Any], frames: dict[_Name, FloatArray]) -> Honesty:
-    vertices = {_name(vertex["id"]): vertex for vertex in run["vertices"]}
+def _vertex_honesty(run: RunFile, frames: dict[_Name, FloatArray]) -> Honesty:
+    vertices = {vertex["id"]: vertex for vertex in run["vertices"]}
     true, estimated, covariances = [], [], []
     for component in run["components"]:
-        root, *others = map(_name, component)
+        root, *others = component
         for name in others:
             if root in frames and name in frames and vertices[name]["covariance"] is not None:
                 true.append(se2.between(frames[root], frames[name]))
@@ -141,10 +125,10 @@ def _vertex_honesty(run: dict[str, Any], frames: dict[_Name, FloatArray]) -> Hon
     return _honesty(true, estimated, covariances)
 
 
-def _edge_honesty(run: dict[str, Any], frames: dict[_Name, FloatArray]) -> dict[str, Honesty]:
+def _edge_honesty(run: RunFile, frames: dict[_Name, FloatArray]) -> dict[str, Honesty]:
     kinds: dict[str, list[tuple[Any, Any, Any]]] = {}
     for edge in run["edges"]:
-        tail, head = _name(edge["tail"]), _name(edge["head"])
+        tail, head = edge["tail"], edge["head"]
         if edge["fate"] == "accepted" and tail in frames and head in frames:
             true = se2.between(frames[tail], frames[head])
             kinds.setdefault(edge["kind"], []).append((true, edge["measurement"], edge["covariance"]))

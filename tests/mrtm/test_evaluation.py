@@ -26,6 +26,7 @@ from mrtm.evaluation import (
 from mrtm.output.export import export
 from mrtm.output.report import evaluation_report
 from tests.mrtm.sample_run import sample_run
+from tools.fuzzing.seeds import RUNS
 
 Array = npt.NDArray[np.float64]
 
@@ -285,3 +286,32 @@ def test_truth_must_name_robots_of_the_run(tmp_path: Path) -> None:
         evaluate_output(tmp_path, truth={"pink": tmp_path / "x.tum"})
     with pytest.raises(EvaluationError, match="one truth for 3 robots"):
         evaluate_output(tmp_path, truth=tmp_path / "x.tum")
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("robots", "robot"), {}),
+        (("robots",), {}),
+        (("robots",), {"../../robot": {"component": 0}}),
+        (("components", 0), []),
+        (("vertices", 0, "id"), ["robot"]),
+        (("vertices", 0, "first_scan", "pose"), [1, 2]),
+        (("vertices", 0, "first_scan", "time"), float("nan")),
+        (("vertices", 1, "pose", 0), 1e300),
+        (("vertices", 1, "covariance"), [[1, 0, 0], [0, 1, 0], [0, 0, 0]]),
+        (("edges", 0, "covariance", 0), [1, 2]),
+        (("edges", 0), None),
+    ],
+)
+def test_a_damaged_run_is_named(tmp_path: Path, place: tuple[str | int, ...], value: object) -> None:
+    content = json.loads(RUNS[0])
+    *way, last = place
+    entry = content
+    for step in way:
+        entry = entry[step]
+    entry[last] = value
+    (tmp_path / "run.json").write_text(json.dumps(content))
+    with pytest.raises(EvaluationError, match=r"run\.json: not what a run writes \(.*\); run again") as caught:
+        evaluate_output(tmp_path)
+    assert str(caught.value).isprintable()

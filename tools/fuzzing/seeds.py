@@ -2,6 +2,7 @@
 
 import bz2
 import gzip
+import json
 import lzma
 import math
 import struct
@@ -144,3 +145,37 @@ TRAJECTORIES = [
     b"".join(b"%d.5 0.1 %d 0 0 0 0.6 0.8\n" % (time, time) for time in range(20)),
     b"# t x y z\n1 2 3 0 0 0 0 1\n",
 ]
+RUNS = [
+    json.dumps(
+        {
+            "robots": {"robot": {"component": 0}},
+            "components": [[["robot", 0], ["robot", 1]]],
+            "vertices": [
+                {
+                    "id": ["robot", 0],
+                    "pose": [0, 0, 0],
+                    "covariance": None,
+                    "first_scan": {"time": 1.5, "pose": [0, 0, 0]},
+                },
+                {
+                    "id": ["robot", 1],
+                    "pose": [1, 2, 0.5],
+                    "covariance": [[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.001]],
+                    "first_scan": {"time": 5.5, "pose": [0.1, 0, 0]},
+                },
+            ],
+            "edges": [
+                {
+                    "tail": ["robot", 0],
+                    "head": ["robot", 1],
+                    "kind": "loop",
+                    "fate": "accepted",
+                    "measurement": [1, 2, 0.5],
+                    "covariance": [[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.001]],
+                }
+            ],
+        },
+        indent=1,
+    ).encode()
+]
+"""``run.json`` of a run whose robot drove the first of ``TRAJECTORIES``."""

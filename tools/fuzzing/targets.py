@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -12,8 +13,10 @@ from frontend.readers import open_log
 from frontend.records import LaserScan
 from mrtm.config import load_config, to_yaml
 from mrtm.errors import MrtmError
+from mrtm.evaluation import evaluate_output
 from mrtm.evaluation.relations import read_relations
 from mrtm.evaluation.trajectory import read_tum
+from mrtm.info import describe, log_info
 from tools.fuzzing import seeds
 
 ERRORS = (FrontendError, MrtmError)
@@ -47,6 +50,8 @@ def targets() -> list[Target]:
         Target("option", seeds.OPTIONS, _read_option),
         Target("relations", seeds.RELATIONS, _read_relations),
         Target("trajectory", seeds.TRAJECTORIES, _read_trajectory),
+        Target("run", seeds.RUNS, _read_run),
+        Target("info", [log for plain in seeds.LOGS.values() for log in plain], _read_info),
     ]
 
 
@@ -113,6 +118,24 @@ def _read_trajectory(file: Path) -> None:
     poses = read_tum(file)
     _must(bool(np.all(np.isfinite(poses.times)) and np.all(np.isfinite(poses.poses))), "not finite")
     _must(len(poses.times) == len(poses.poses) > 0, "lengths differ")
+
+
+def _read_run(file: Path) -> None:
+    """The file as the ``run.json`` of a run whose other files are as they should be."""
+    with TemporaryDirectory(dir=file.parent) as out:
+        trajectory = Path(out, "trajectory", "robot.tum")
+        trajectory.parent.mkdir()
+        trajectory.write_bytes(seeds.TRAJECTORIES[0])
+        Path(out, "run.json").write_bytes(file.read_bytes())
+        evaluation = evaluate_output(Path(out), truth=trajectory)
+        _must(len(evaluation.ate) == 1, "not one component")
+        _must((Path(out) / "evaluation.json").exists(), "nothing written")
+
+
+def _read_info(file: Path) -> None:
+    lines = list(describe(log_info(file)))
+    for line in lines:
+        _must(line.isprintable(), f"not one printable line: {line!r}")
 
 
 def _one_line(message: str) -> None:

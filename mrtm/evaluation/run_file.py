@@ -1,0 +1,79 @@
+"""What the evaluation reads of a run's ``run.json``, checked."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
+from typing_extensions import TypedDict
+
+from mrtm.evaluation.errors import EvaluationError
+from mrtm.plain_yaml import shorten
+
+_Number = Annotated[float, Field(gt=-1e12, lt=1e12)]  # false for NaN
+_Three = tuple[_Number, _Number, _Number]
+
+
+def _positive_definite(covariance: tuple[_Three, _Three, _Three]) -> tuple[_Three, _Three, _Three]:
+    values = np.array(covariance)
+    scale = np.abs(values).max()
+    if np.abs(values - values.T).max() > 1e-6 * scale or np.linalg.eigvalsh(values)[0] <= 1e-12 * scale:
+        raise ValueError("not a covariance")
+    return covariance
+
+
+_Robot = Annotated[str, Field(pattern=r"^[^/\x00]+$")]  # its files are named after it
+_Name = tuple[_Robot, int]
+_Covariance = Annotated[tuple[_Three, _Three, _Three], AfterValidator(_positive_definite)]
+
+
+class RobotEntry(TypedDict):
+    component: int
+
+
+class ScanEntry(TypedDict):
+    time: _Number
+    pose: _Three
+
+
+class VertexEntry(TypedDict):
+    id: _Name
+    pose: _Three
+    covariance: _Covariance | None
+    first_scan: ScanEntry | None
+
+
+class EdgeEntry(TypedDict):
+    tail: _Name
+    head: _Name
+    kind: str
+    fate: str
+    measurement: _Three
+    covariance: _Covariance
+
+
+class RunFile(TypedDict):
+    """The part of ``run.json`` that the evaluation needs; see the export for what the keys mean."""
+
+    robots: Annotated[dict[_Robot, RobotEntry], Field(min_length=1)]
+    components: list[Annotated[list[_Name], Field(min_length=1)]]
+    vertices: list[VertexEntry]
+    edges: list[EdgeEntry]
+
+
+def read_run(out: Path) -> RunFile:
+    """Read ``out/run.json``.
+
+    Raises:
+        EvaluationError: it cannot be read, or is not what a run writes.
+    """
+    path = out / "run.json"
+    try:
+        return TypeAdapter(RunFile).validate_json(path.read_bytes())
+    except OSError as error:
+        raise EvaluationError(f"{path}: cannot be read ({error.strerror}); give the directory a run wrote") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or "its text"
+        complaint = shorten(f"{place}: {first['msg']}")
+        raise EvaluationError(f"{path}: not what a run writes ({complaint}); run again") from error
