@@ -4,8 +4,8 @@ A cell holds log-odds in steps of 1/UNIT nat (int8) and, for matching below the 
 the endpoints that fell into the cell and the mean of their normals. ``index`` names for every cell the nearest surfel
 within REACH cells (0: none), so that finding the surface of an endpoint is one look-up.
 
-Particle filters need many maps of the same fixed size: ``Maps`` holds them as stacked arrays. Pages of the stack that no
-beam ever touched cost no memory.
+Particle filters need many maps of the same fixed size: ``Maps`` holds them as stacked arrays. Pages of the stack that
+no beam ever touched cost no memory.
 """
 
 import math

@@ -72,7 +72,7 @@ class LocalSlam:
             self.filter.insert(points, poses)
 
     def particles(self, pose: FloatArray, covariance: FloatArray) -> FloatArray:
-        """(particles, 3) around ``pose`` (3,), ``covariance`` (3, 3) in its tangent frame; the first is ``pose`` itself."""
+        """(particles, 3) around ``pose`` (3,), ``covariance`` (3, 3) in its tangent frame; ``pose`` is the first."""
         draws = self._random.multivariate_normal(np.zeros(3), covariance, self.parameters.particles)
         draws[0] = 0.0
         return se2.compose(pose, draws)

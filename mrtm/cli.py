@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,8 +13,9 @@ from mrtm import __version__
 from mrtm.errors import MrtmError
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+
     from mrtm.config import Config
-    from mrtm.evaluation import Evaluation, Statistics
 
 app = typer.Typer(
     name="mrtm",
@@ -59,7 +60,11 @@ def run(
     from mrtm.session import run_log
 
     with showing(quiet) as progress:
-        run_log(log, out, parameters, progress)
+        result = run_log(log, out, parameters, progress)
+    if not quiet:
+        from mrtm.output.report import run_report
+
+        _print([*run_report(result), f"the map is {out / 'map.png'}, everything else in {out}"])
 
 
 @app.command()
@@ -72,9 +77,9 @@ def evaluate(
     if relations is None and truth is None:
         raise typer.BadParameter("give --relations FILE, --truth TUM, or both")
     from mrtm.evaluation import evaluate_output
+    from mrtm.output.report import evaluation_report
 
-    for line in _summary(evaluate_output(out, relations, truth)):
-        typer.echo(line)
+    _print(evaluation_report(evaluate_output(out, relations, truth)))
 
 
 @app.command()
@@ -136,27 +141,12 @@ def fetch(
         typer.echo(f"licence: {log.licence}; cite: {log.citation}; described at {log.page}")
 
 
-def _summary(evaluation: "Evaluation") -> Iterator[str]:
-    """One line a measure: mean, deviation and what was left out."""
-    for name, errors in (("relations", evaluation.relations), ("between robots", evaluation.relations_across)):
-        if errors is not None and errors.count + errors.no_scan + errors.unconnected:
-            yield (
-                f"{name}: {_spread(errors.translation)} m, {_spread(errors.rotation)} deg over {errors.count}; "
-                f"left out: {errors.no_scan} without a scan near, {errors.unconnected} never joined"
-            )
-    for absolute in evaluation.ate:
-        yield (
-            f"ATE of {', '.join(absolute.robots)}: RMSE {absolute.translation.rmse:.4f} m, "
-            f"{absolute.rotation.rmse:.3f} deg over {absolute.count}; left out: {absolute.no_scan} without a scan near"
-        )
-    honesty = {"vertices": evaluation.vertices, **(evaluation.edges or {})}
-    for name, measured in honesty.items():
-        if measured is not None and measured.count:
-            yield f"NEES of {name}: {measured.nees.mean:.2f} over {measured.count}"
+def _print(parts: "Sequence[RenderableType]") -> None:
+    from rich.console import Console
 
-
-def _spread(errors: "Statistics") -> str:
-    return f"{errors.mean:.4f} ± {errors.std:.4f} (median {errors.median:.4f})"
+    console = Console(soft_wrap=True, highlight=False)
+    for part in parts:
+        console.print(part)
 
 
 def _load(file: Path | None, preset: str | None, options: Sequence[str]) -> "Config":

@@ -51,8 +51,9 @@ class Event:
 class RunResult:
     """Everything a run knows at its end, in the joint frame of each component's root.
 
-    ``timings`` are seconds by stage, ``longest`` those of the longest single call, ``counts`` plain numbers
-    (scans, vertices, ...), ``blemishes`` one line each about what the log's reader met. ``components`` lists the vertices of each connected component, root first.
+    ``timings`` are seconds by stage, ``longest`` those of the longest single call, ``counts`` plain numbers (scans,
+    vertices, ...), ``blemishes`` one line each about what the log's reader met. ``components`` lists the vertices of
+    each connected component, root first.
     """
 
     config: dict[str, Any]

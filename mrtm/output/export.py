@@ -29,8 +29,8 @@ def export(result: RunResult, out: Path) -> None:
     """Write ``result`` to the directory ``out`` as the design's "What a run leaves behind" has it.
 
     Every file appears whole or not at all, ``run.json`` last; what an earlier run left and this one has no use for is
-    removed. The same result gives the same bytes, except for ``timings`` and ``longest`` in ``run.json``, among which the seconds
-    spent here are entered as ``output``.
+    removed. The same result gives the same bytes, except for ``timings`` and ``longest`` in ``run.json``,
+    among which the seconds spent here are entered as ``output``.
     """
     started = time.perf_counter()
     for directory in (out, out / "trajectory", out / "local_maps"):

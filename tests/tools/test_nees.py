@@ -113,6 +113,7 @@ def a_run(measured: gtsam.Pose2, truth: FloatArray) -> RunResult:
             Event(3.0, "r", "edge updated", {"edge": str(last)}),
         ],
         timings={},
+        longest={},
         counts={},
         blemishes=[],
     )
