@@ -12,6 +12,7 @@ from frontend.rbpf import ParticleFilter, Step
 from frontend.records import FloatArray
 from frontend.refine import refine
 
+PATIENCE = 2.5  # times the usual distance between key scans
 SOFTNESS = 0.06  # difference of two scores that makes one hypothesis e times likelier than the other
 SPREAD = np.diag([0.03**2, 0.03**2, 0.01**2])  # covariance of the particles around their hypothesis
 
@@ -89,7 +90,9 @@ class LocalSlam:
         p = self.parameters
         step = self.filter.track(points, increment)
         offset = se2.between(self.filter.poses[self.filter.leader], step.pose)
-        if np.hypot(offset[0], offset[1]) >= p.key_distance or abs(offset[2]) >= p.key_angle:
+        # While it is open which way the robot drives, drawing waits a little.
+        patience = PATIENCE if self.filter.doubt > 0.0 else 1.0
+        if np.hypot(offset[0], offset[1]) >= patience * p.key_distance or abs(offset[2]) >= patience * p.key_angle:
             self._update(points)
             offset = np.zeros(3)
         self._points.append(points)

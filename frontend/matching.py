@@ -44,7 +44,9 @@ def match(log_odds, index, surfels, resolution, hits, start, prior, information,
     inv = 1.0 / resolution
     half_u = 0.5 * columns
     half_v = 0.5 * rows
-    x, y, theta = start[0], start[1], start[2]
+    x, y = start[0], start[1]
+    turn = start[2] - prior[2]  # both on the same side of pi
+    theta = prior[2] + turn - 2.0 * math.pi * math.floor((turn + math.pi) / (2.0 * math.pi))
     weight_line = 1.0 / (sigma * sigma)
     weight_post = weight_line / (POST * POST)
     core = 1.0 / (CORE * CORE)

@@ -107,13 +107,17 @@ class Step:
         pose: (3,) local_T_robot.
         fit: fraction of the endpoints in known space that the map explains, 0 to 1.
         known: fraction of all endpoints that lie in known space.
+        log_likelihood: of the scan, relative to that of a perfect fit.
         searched: 0 if the plain match was good; 1 or 2 for a search around or far around the expected pose.
+        reversed: odometry was found to drive the other way than it says, from here on.
     """
 
     pose: FloatArray
     fit: float
     known: float
+    log_likelihood: float
     searched: int = 0
+    reversed: bool = False
 
 
 class ParticleFilter:
@@ -126,7 +130,6 @@ class ParticleFilter:
         self.poses = np.zeros((p.particles, 3))
         self._seed = seed
         self._steps = 0
-        self._previous = np.zeros((p.particles, 3))
         self._log_weights = np.zeros(p.particles)
         self._covariances = np.zeros((p.particles, 3, 3))
         self._variances = np.zeros(3)
@@ -135,6 +138,10 @@ class ParticleFilter:
         self.resampled = 0
         self.leader = 0
         self.pose = np.zeros(3)
+        self.doubt = 0.0  # log-likelihood by which the opposite sign explains the last scans better
+        self._sign = np.ones(3)
+        self._mirror = np.zeros(3)
+        self._mirror_motion = np.zeros(3)
 
     def start(self, poses: FloatArray, known: Maps | None = None) -> None:
         """Begin a local map: M1 and M7a with ``poses`` all zero and nothing known; M3's re-entry with the poses drawn
@@ -155,8 +162,7 @@ class ParticleFilter:
         self._history = [(self.poses.copy(), np.arange(count))]
         self.leader = 0
         self.pose = self.poses[0].copy()
-        self._variances[:] = 0.0
-        self._motion[:] = 0.0
+        self._rest()
 
     @property
     def weights(self) -> FloatArray:
@@ -165,28 +171,55 @@ class ParticleFilter:
         return np.asarray(w / w.sum())
 
     def track(self, points: Points, increment: FloatArray) -> Step:
-        """Follow the best particle over one odometry ``increment`` (3,) by matching ``points`` to its map."""
-        p = self.parameters
-        added = motion.variance(increment, p.motion)
+        """Follow the best particle over one odometry ``increment`` (3,) by matching ``points`` to its map.
+
+        Public logs have stretches of reverse driving recorded as forward, or the other way round. So a second track runs
+        along under the opposite sign; where it has explained the scans better for a while, it becomes the first.
+        """
+        increment = increment * self._sign
+        added = motion.variance(increment, self.parameters.motion)
         self._variances += added
+        step, merit = self._follow(points, self.pose, increment, added)
         self._motion = se2.compose(self._motion, increment)
-        prior = se2.compose(self.pose, increment)
-        information = np.diag(1.0 / added)
-        step = self._match(points, prior.copy(), prior, information)
+        opposite = increment * OPPOSITE
+        mirrored, mirrored_merit = self._follow(points, self._mirror, opposite, added)
+        self._mirror_motion = se2.compose(self._mirror_motion, opposite)
+        # One scan proves little: its time may be off by a good part of the way driven.
+        self.doubt = max(0.0, self.doubt + min(mirrored_merit - merit, REVERSED / REVERSED_SCANS))
+        turned_over = self.doubt >= REVERSED
+        if turned_over:
+            self._sign = self._sign * OPPOSITE
+            self._motion, self.doubt = self._mirror_motion, 0.0
+            step = mirrored
         if len(points.hits) >= MIN_POINTS and not _good(step):
-            step = self._search(points, prior, increment, step)
+            step = self._search(points, se2.compose(self.pose, increment), increment, step)
+        step.reversed = turned_over
         self.pose = step.pose
+        if self.doubt == 0.0:
+            self._mirror, self._mirror_motion = step.pose, self._motion
+        else:
+            self._mirror = mirrored.pose
         return step
+
+    def _follow(
+        self, points: Points, pose: FloatArray, increment: FloatArray, variances: FloatArray
+    ) -> tuple[Step, float]:
+        """The match after one increment, and its log-likelihood together with that of the increment it implies."""
+        prior = se2.compose(pose, increment)
+        step = self._match(points, prior.copy(), prior, np.diag(1.0 / variances))
+        off = se2.between(prior, step.pose)
+        surprise = 4.5 * math.log1p(float(off @ (off / variances)) / 9.0)
+        return step, EVIDENCE * step.log_likelihood - surprise
 
     def _match(self, points: Points, start: FloatArray, prior: FloatArray, information: FloatArray) -> Step:
         m = self.leader
-        fit, near, free, _ = match(
+        fit, near, free, log_likelihood = match(
             self.maps.log_odds[m], self.maps.index[m], self.maps.surfels[m], self.maps.resolution,
             points.hits, start, prior, information, self.parameters.sigma, np.empty((3, 3)),
         )  # fmt: skip
         known = near + free
         start[2] = se2.wrap(start[2])
-        return Step(start, fit / max(1, known), known / max(1, len(points.hits)))
+        return Step(start, fit / max(1, known), known / max(1, len(points.hits)), log_likelihood)
 
     def _search(self, points: Points, prior: FloatArray, increment: FloatArray, best: Step) -> Step:
         """The match is poor: odometry may be wrong. Look around, and if that does not help, far around.
@@ -247,8 +280,12 @@ class ParticleFilter:
             self.insert(points, self.poses)
         self.leader = int(np.argmax(self._log_weights))
         self.pose = self.poses[self.leader].copy()
-        self._variances[:] = 0.0
-        self._motion[:] = 0.0
+        self._rest()
+
+    def _rest(self) -> None:
+        """The particles are where the track is."""
+        self._variances, self._motion, self._mirror_motion = np.zeros(3), np.zeros(3), np.zeros(3)
+        self._mirror, self.doubt = self.pose, 0.0
 
     def insert(self, points: Points, poses: FloatArray) -> None:
         """Add a scan to every particle's map, at ``poses`` (particles, 3)."""
@@ -307,6 +344,10 @@ GOOD_FIT = 0.75  # a match that explains less than this of the known space, or
 GOOD_KNOWN = 0.25  # that has less than this in known space, is searched around
 LOST_FIT = 0.45  # below this also far around
 MARGIN = 0.05  # by how much a searched match must beat the plain one
+OPPOSITE = np.array([-1.0, -1.0, 1.0])
+EVIDENCE = 0.2  # of a scan's log-likelihood, in telling forward from backward
+REVERSED = 16.0  # log-likelihood at which odometry is taken to have the wrong sign,
+REVERSED_SCANS = 8  # and the least number of scans that must say so
 DISBELIEF = 0.05  # what it costs, in fit, to contradict odometry e times more
 
 

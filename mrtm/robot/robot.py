@@ -89,6 +89,8 @@ class Robot:
             step = self._slam.add(points, increment)  # M3
         if step.searched:
             self._tell("searched wider", level=step.searched, fit=step.fit, known=step.known)
+        if step.reversed:
+            self._tell("odometry reversed")
         outside = float(np.max(np.abs(step.pose[:2]))) / self._half_width  # M4
         if self._trial is not None:
             self._trial.add(step, increment)
