@@ -83,8 +83,7 @@ class Archive:
         self._at = self._start = self._start + 1
         while True:
             for found in _HEADER.finditer(self._data, self._at):
-                # A name that ends where the data do may go on in the next block.
-                if found.end(3) < len(self._data) and len(found[3]) == (found[1] or found[2])[0] & 0x7F:
+                if len(found[3]) == (found[1] or found[2])[0] & 0x7F:
                     self._at = self._start = found.start()
                     return True
             # The last bytes may be the beginning of a header.
