@@ -184,7 +184,8 @@ def fits_at(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 def test_a_trial_adds_up_what_it_saw() -> None:
     t = trial([0.9, 0.8], [0.7, 0.6], 0.5)
-    assert (t.fits, t.knowns, t.distance) == ([0.9, 0.8], [0.7, 0.6], pytest.approx(1.0))
+    assert (t.fits, t.knowns) == ([0.9, 0.8], [0.7, 0.6])
+    assert t.distance == pytest.approx(1.0)
     before = t.distance
     t.add(Step(np.zeros(3), 0.9, 0.9), np.array([0.0, 0.0, -1.0]))
     assert t.distance > before  # turning on the spot shows a place, too

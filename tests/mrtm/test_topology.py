@@ -1,5 +1,7 @@
 """The topological map: versions, fates, and the projection along shortest paths."""
 
+from itertools import pairwise
+
 import gtsam
 import numpy as np
 import pytest
@@ -28,7 +30,7 @@ def chain(rng: np.random.Generator, steps: list[tuple[gtsam.Pose2, bool]], sigma
     topology = Topology("red")
     vertices = [topology.new_vertex() for _ in range(len(steps) + 1)]
     edges = []
-    for (a, b), (step, forward) in zip(zip(vertices[:-1], vertices[1:], strict=True), steps, strict=True):
+    for (a, b), (step, forward) in zip(pairwise(vertices), steps, strict=True):
         if forward:
             edges.append(join(topology, a, b, step, covariance(rng, sigma)))
         else:
