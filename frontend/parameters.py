@@ -5,6 +5,9 @@ import operator
 from dataclasses import dataclass, field
 from typing import Annotated, get_type_hints
 
+# Of the grids of all particles together, a byte each.
+MOST_CELLS = 4e9
+
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
@@ -77,12 +80,12 @@ class Section:
 class MotionParameters(Section):
     """Standard deviations of one odometry increment: a floor, and growth with the distance and the turn."""
 
-    xy_floor: Annotated[float, Parameter("m", "position noise of any increment", gt=0)] = 0.003
-    xy_per_metre: Annotated[float, Parameter("m/m", "position noise for each metre driven", ge=0)] = 0.1
-    xy_per_radian: Annotated[float, Parameter("m/rad", "position noise for each radian turned", ge=0)] = 0.1
-    theta_floor: Annotated[float, Parameter("rad", "heading noise of any increment", gt=0)] = 0.003
-    theta_per_radian: Annotated[float, Parameter("rad/rad", "heading noise for each radian turned", ge=0)] = 0.1
-    theta_per_metre: Annotated[float, Parameter("rad/m", "heading noise for each metre driven", ge=0)] = 0.05
+    xy_floor: Annotated[float, Parameter("m", "position noise of any increment", ge=1e-5, le=10)] = 0.003
+    xy_per_metre: Annotated[float, Parameter("m/m", "position noise for each metre driven", ge=0, le=10)] = 0.1
+    xy_per_radian: Annotated[float, Parameter("m/rad", "position noise for each radian turned", ge=0, le=10)] = 0.1
+    theta_floor: Annotated[float, Parameter("rad", "heading noise of any increment", ge=1e-5, le=10)] = 0.003
+    theta_per_radian: Annotated[float, Parameter("rad/rad", "heading noise for each radian turned", ge=0, le=10)] = 0.1
+    theta_per_metre: Annotated[float, Parameter("rad/m", "heading noise for each metre driven", ge=0, le=10)] = 0.05
 
 
 @dataclass(frozen=True)
@@ -103,10 +106,20 @@ class FilterParameters(Section):
     max_beams: Annotated[int, Parameter("", "of a scan with more beams an even subset is used", ge=10)] = 181
     key_distance: Annotated[float, Parameter("m", "the filter takes a step after this way", gt=0)] = 0.2
     key_angle: Annotated[float, Parameter("rad", "or after this turn", gt=0)] = 0.2
-    sigma: Annotated[float, Parameter("m", "standard deviation of an endpoint across its wall", gt=0)] = 0.02
+    sigma: Annotated[float, Parameter("m", "standard deviation of an endpoint across its wall", ge=1e-3, le=1)] = 0.02
     independence: Annotated[
         float, Parameter("", "part of a scan's endpoints that weigh a particle as if independent", gt=0, le=1)
     ] = 0.05
-    drift_xy: Annotated[float, Parameter("m/sqrt(m)", "position error that all particles share", ge=0)] = 0.015
-    drift_theta: Annotated[float, Parameter("rad/sqrt(m)", "heading error that all particles share", ge=0)] = 0.004
+    drift_xy: Annotated[float, Parameter("m/sqrt(m)", "position error that all particles share", ge=0, le=10)] = 0.015
+    drift_theta: Annotated[float, Parameter("rad/sqrt(m)", "heading error that all particles share", ge=0, le=10)] = (
+        0.004
+    )
     motion: MotionParameters = field(default_factory=MotionParameters)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        across = self.map_width / self.resolution
+        cells = self.particles * across * across
+        if cells > MOST_CELLS:
+            complaint = f"with {self.particles} particles and {self.resolution:g} m a cell it takes {cells:.1e} cells, "
+            raise ParameterError("map_width", self.map_width, complaint + f"more than {MOST_CELLS:.0e}")

@@ -82,14 +82,12 @@ class Archive:
         """Leave an object that cannot be read: search for the next header; whether there is one."""
         self._at = self._start = self._start + 1
         while True:
-            rest = max(self._at, len(self._data) - _LONGEST_NAME)  # may be the beginning of a header
             for found in _HEADER.finditer(self._data, self._at):
-                if found.end(3) == len(self._data):
-                    rest = found.start()
-                elif len(found[3]) == (found[1] or found[2])[0] & 0x7F:
+                if len(found[3]) == (found[1] or found[2])[0] & 0x7F:
                     self._at = self._start = found.start()
                     return True
-            self._at = self._start = rest
+            # The last bytes may be the beginning of a header.
+            self._at = self._start = max(self._at, len(self._data) - _LONGEST_NAME)
             if not self._filled(len(self._data) - self._at + 1):
                 return False
 

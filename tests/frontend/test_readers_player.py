@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from frontend.errors import LogError
 from frontend.readers import Log, Record, open_log
-from frontend.records import LaserScan, Sighting
+from frontend.readers.tags import find_tags
+from frontend.records import Laser, LaserScan, Sighting
 
 
 def position(
@@ -102,14 +103,16 @@ def test_nothing_is_interpolated_across_a_step_of_the_clock(tmp_path: Path) -> N
     scans, _, log = read(tmp_path, lines)
     assert [scan.odometry[0] for scan in scans] == [1.0, 3.0]
     assert log.report.backward_steps == 1
+    (scan,), _, _ = read(tmp_path, [position(10.0, x=1.0), position(5.0, x=3.0), laser(9.0, [2.0, 2.0])])
+    assert scan.odometry[0] == 3.0
 
 
 def test_a_time_far_ahead_holds_nothing_up_for_long(tmp_path: Path) -> None:
     lines = [position(0.0), laser(1e9, [2.0, 2.0])]
-    for i in range(1, 200):
+    for i in range(1, 1500):
         lines += [position(i, x=float(i)), laser(i, [2.0, 2.0])]
     scans, _, _ = read(tmp_path, lines)
-    assert [scan.odometry[0] for scan in scans[1:]] == list(range(1, 200))
+    assert [scan.odometry[0] for scan in scans[1:]] == list(range(1, 1500))
 
 
 def test_other_devices_lasers_and_robots_are_left_out_and_counted(tmp_path: Path) -> None:
@@ -187,6 +190,15 @@ def test_a_tag_is_one_sighting_seen_from_the_robot(tmp_path: Path) -> None:
     assert sighting.bearing == pytest.approx(np.radians(30.5), abs=1e-3)
     assert log.report.sightings == 1
     assert len(list(log.scans())) == 2
+
+
+def test_a_sighting_is_in_the_robots_frame_wherever_the_laser_sits() -> None:
+    laser = Laser(np.radians([0.0, 1.0, 90.0]), np.array([0.5, 1.0, np.pi / 2]), 50.0)
+    ranges = np.array([2.0, 2.0, 3.0], np.float32)
+    (ahead,) = find_tags(7.0, ranges, np.array([True, False, False]), laser)
+    assert (ahead.time, ahead.range, ahead.bearing) == pytest.approx((7.0, np.hypot(0.5, 3.0), np.arctan2(3.0, 0.5)))
+    (left,) = find_tags(7.0, ranges, np.array([False, False, True]), laser)
+    assert (left.range, left.bearing) == pytest.approx((np.hypot(2.5, 1.0), np.arctan2(1.0, -2.5)))
 
 
 @pytest.mark.parametrize(

@@ -64,6 +64,13 @@ def test_observations_take_odometry_at_their_time(tmp_path: Path, compress: Call
     assert log.report.lines == {"CObservationOdometry": 5, "CObservation2DRangeScan": 5}
 
 
+def test_times_that_are_all_the_same(tmp_path: Path) -> None:
+    """As some converters write them: then the odometry before the scan in the file is its own."""
+    content = (NEW.odometry((i, 0, 0), 1e9) + NEW.scan((1.0 + i, 2.0), 1e9) for i in range(9))
+    scans, _ = read(tmp_path, b"".join(content))
+    assert [scan.odometry[0] for scan in scans] == list(range(9))
+
+
 def poses_of_frames(writer: Writer, *versions: int, whole: bool = False) -> bytes:
     """A robot that drives a square, one side a frame."""
     entries = []

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from frontend import se2
 from frontend.errors import LogError
 from frontend.readers import open_log
 from frontend.records import FloatArray, Laser, LaserScan
@@ -79,6 +80,18 @@ def test_the_reader_gives_back_what_was_written(
 def test_the_mount_of_a_robot_that_never_turns_is_kept(tmp_path: Path) -> None:
     read = read_back(drive(mount=(0.25, -0.1, 0.4), turn=0.0), tmp_path / "log.clf", "ROBOTLASER1")
     np.testing.assert_allclose(read[0].laser.mount, [0.25, -0.1, 0.4], atol=1e-5)
+
+
+@pytest.mark.parametrize(("mount", "tail"), [((0.25, 0.0, 0.0), 9), ((0.25, -0.1, 0.4), 14)])
+def test_lines_hold_the_poses_of_laser_and_robot(tmp_path: Path, mount: tuple[float, float, float], tail: int) -> None:
+    scans = drive(mount=mount)
+    write_carmen(scans, tmp_path / "log.clf")
+    lines = [line.split() for line in (tmp_path / "log.clf").read_text().splitlines()]
+    lasers = [line for line in lines if line[0].endswith(("FLASER", "ROBOTLASER1"))]
+    for words, scan in zip(lasers, scans, strict=True):
+        poses = [float(word) for word in words[-tail : 6 - tail]]
+        np.testing.assert_allclose(poses[:3], se2.compose(scan.odometry, scan.laser.mount), atol=1e-6)
+        np.testing.assert_allclose(poses[3:], scan.odometry, atol=1e-6)
 
 
 def test_times_finer_than_a_microsecond_are_kept(tmp_path: Path) -> None:

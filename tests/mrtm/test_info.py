@@ -78,7 +78,7 @@ def test_info_of_a_carmen_log(tmp_path: Path) -> None:
         "lines": "6 FLASER, 1 #, 1 PARAM",
         "blemishes": "",
     }
-    assert f"  {path}:8: FLASER: 3 readings in 3 fields" in done.stdout.splitlines()
+    assert f"  {path}:8: FLASER: only 0 fields" in done.stdout.splitlines()
     assert f"  {path}: masked 5 unusable ranges (0.56 %)" in done.stdout.splitlines()
 
 

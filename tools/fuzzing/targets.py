@@ -90,7 +90,7 @@ def _check_scan(scan: LaserScan) -> None:
     usable = scan.ranges[~np.isnan(scan.ranges)]
     _must(bool(np.all(usable > 0.0)), "a range that is not positive")
     _must(bool(np.all(usable[np.isfinite(usable)] <= laser.max_range)), "a range beyond max_range")
-    _must(scan.odometry.shape == (3,) and bool(np.all(np.isfinite(scan.odometry))), f"odometry {scan.odometry}")
+    _must(scan.odometry.shape == (3,) and bool(np.all(np.isfinite(scan.odometry))), "odometry not finite")
     _must(-np.pi < scan.odometry[2] <= np.pi, f"heading {scan.odometry[2]}")
 
 

@@ -1,0 +1,67 @@
+"""The default configuration on real logs, against the bars it must reach."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factors import EdgeKind
+from frontend.readers import open_log
+from mrtm.config import load_config
+from mrtm.evaluation import TimedPoses, evaluate_ate, evaluate_relations, read_relations, read_tum
+from mrtm.result import RunResult
+from mrtm.session import map_scans
+
+pytestmark = pytest.mark.slow
+
+CHI2_999 = 16.27
+"""3 degrees of freedom, 99.9 %."""
+
+
+def run(log: Path) -> tuple[RunResult, dict[str, TimedPoses]]:
+    if not log.exists():
+        pytest.skip(f"no {log}")
+    result = map_scans(open_log(log).scans(), load_config(), lambda fraction, doing: None)
+    return result, {name: TimedPoses(t.times, t.poses) for name, t in result.trajectories.items()}
+
+
+def check_loops(result: RunResult) -> None:
+    """A false loop either strains against the rest of the graph, or bends it: that is for the relations to show."""
+    loops = [fate for fate in result.edges if fate.fate == "accepted" and fate.edge.kind is not EdgeKind.INTER_VERTEX]
+    assert loops
+    for fate in loops:
+        assert fate.chi2 < CHI2_999, fate.edge
+        edge = fate.edge
+        a, b = result.vertex_poses[edge.tail], result.vertex_poses[edge.head]
+        strain = edge.measurement.between(a.between(b))
+        assert np.hypot(strain.x(), strain.y()) < 0.5, edge
+    assert len(result.components) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "scans", "metres", "degrees", "worst"),
+    [("intel", 13631, 0.026, 1.0, 0.5), ("aces", 7374, 0.046, 0.7, 1.0)],
+)
+def test_relations(data: Path, name: str, scans: int, metres: float, degrees: float, worst: float) -> None:
+    result, trajectories = run(data / f"{name}.clf.bz2")
+    assert result.counts["scans"] == scans
+    true = read_relations(data / f"{name}.relations")
+    errors, _ = evaluate_relations(true, trajectories)
+    assert errors.count > 0.95 * len(true.times)
+    assert errors.translation.mean <= metres
+    assert errors.rotation.mean <= degrees
+    assert errors.translation.max < worst
+    assert errors.rotation.max < 10.0
+    check_loops(result)
+
+
+def test_csail(data: Path) -> None:
+    """The reference is another system's, good to about 0.1 m."""
+    result, trajectories = run(data / "mit-csail.clf.bz2")
+    assert result.counts["scans"] == 1988
+    (robot,) = trajectories
+    errors = evaluate_ate({robot: read_tum(data / "mit-csail.reference.tum")}, trajectories)
+    assert errors.count == 1051
+    assert errors.translation.rmse <= 0.20
+    assert errors.translation.max < 1.0
+    check_loops(result)

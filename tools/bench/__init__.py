@@ -1,0 +1,1 @@
+"""What ``tools.benchmark`` is made of: logs, systems to run, their scores, and the reports."""
