@@ -103,6 +103,23 @@ def _copy_all(lo_a, ix_a, su_a, n_a, bo_a, lo_b, ix_b, su_b, n_b, bo_b, parents,
 
 
 @njit(cache=True, nogil=True)
+def _is_at(surfels, k, u, v, inv, half_u, half_v):  # type: ignore[no-untyped-def]
+    """Whether surfel k lies in the cell, and is not merely the nearest to it."""
+    return int(surfels[k, X] * inv + half_u) == u and int(surfels[k, Y] * inv + half_v) == v
+
+
+@njit(cache=True, nogil=True)
+def _widen(bounds, rows, columns, x, y):  # type: ignore[no-untyped-def]
+    """Take the cell at (x, y), or the nearest to it inside the map, into the bounds; cells, not metres."""
+    u = int(min(max(x, 0.0), columns - 1.0))
+    v = int(min(max(y, 0.0), rows - 1.0))
+    bounds[0] = min(bounds[0], v)
+    bounds[1] = max(bounds[1], v + 1)
+    bounds[2] = min(bounds[2], u)
+    bounds[3] = max(bounds[3], u + 1)
+
+
+@njit(cache=True, nogil=True)
 def _carve(log_odds, index, surfels, resolution, x0, y0, x1, y1, short):  # type: ignore[no-untyped-def]
     """Lower the cells from (x0, y0) towards (x1, y1), stopping ``short`` cells before the end; cells, not metres."""
     dx = x1 - x0
@@ -123,15 +140,15 @@ def _carve(log_odds, index, surfels, resolution, x0, y0, x1, y1, short):  # type
                 log_odds[v, u] = value - MISS
                 if DEAD <= value < DEAD + MISS:
                     k = index[v, u]
-                    if k > 0:
+                    if k > 0 and _is_at(surfels, k, u, v, 1.0 / resolution, 0.5 * columns, 0.5 * rows):
                         surfels[k, N] = 0.0
         x0 += dx
         y0 += dy
 
 
 @njit(cache=True, nogil=True)
-def insert(log_odds, index, surfels, count, bounds, resolution, pose, hits, clear, sensor, carve):  # type: ignore[no-untyped-def]
-    """Add one scan taken at ``pose`` to a map; with ``carve``, the cells that its beams passed become freer.
+def insert(log_odds, index, surfels, count, bounds, resolution, pose, hits, clear, sensor):  # type: ignore[no-untyped-def]
+    """Add one scan taken at ``pose`` to a map: the cells that its beams passed become freer, those that they hit fuller.
 
     Returns the new number of surfels. ``bounds`` is widened in place.
     """
@@ -141,25 +158,19 @@ def insert(log_odds, index, surfels, count, bounds, resolution, pose, hits, clea
     inv = 1.0 / resolution
     half_u = 0.5 * columns
     half_v = 0.5 * rows
-    if carve:
-        x0 = (pose[0] + c * sensor[0] - s * sensor[1]) * inv + half_u
-        y0 = (pose[1] + s * sensor[0] + c * sensor[1]) * inv + half_v
-        for i in range(len(hits)):
-            x1 = (pose[0] + c * hits[i, 0] - s * hits[i, 1]) * inv + half_u
-            y1 = (pose[1] + s * hits[i, 0] + c * hits[i, 1]) * inv + half_v
-            _carve(log_odds, index, surfels, resolution, x0, y0, x1, y1, 1)
-        for i in range(len(clear)):
-            x1 = (pose[0] + c * clear[i, 0] - s * clear[i, 1]) * inv + half_u
-            y1 = (pose[1] + s * clear[i, 0] + c * clear[i, 1]) * inv + half_v
-            _carve(log_odds, index, surfels, resolution, x0, y0, x1, y1, 0)
-            bounds[0] = min(bounds[0], max(0, int(y1)))
-            bounds[1] = max(bounds[1], min(rows, int(y1) + 1))
-            bounds[2] = min(bounds[2], max(0, int(x1)))
-            bounds[3] = max(bounds[3], min(columns, int(x1) + 1))
-        bounds[0] = min(bounds[0], max(0, int(y0)))
-        bounds[1] = max(bounds[1], min(rows, int(y0) + 1))
-        bounds[2] = min(bounds[2], max(0, int(x0)))
-        bounds[3] = max(bounds[3], min(columns, int(x0) + 1))
+    x0 = (pose[0] + c * sensor[0] - s * sensor[1]) * inv + half_u
+    y0 = (pose[1] + s * sensor[0] + c * sensor[1]) * inv + half_v
+    for i in range(len(hits)):
+        x1 = (pose[0] + c * hits[i, 0] - s * hits[i, 1]) * inv + half_u
+        y1 = (pose[1] + s * hits[i, 0] + c * hits[i, 1]) * inv + half_v
+        _carve(log_odds, index, surfels, resolution, x0, y0, x1, y1, 1)
+        _widen(bounds, rows, columns, x1, y1)
+    for i in range(len(clear)):
+        x1 = (pose[0] + c * clear[i, 0] - s * clear[i, 1]) * inv + half_u
+        y1 = (pose[1] + s * clear[i, 0] + c * clear[i, 1]) * inv + half_v
+        _carve(log_odds, index, surfels, resolution, x0, y0, x1, y1, 0)
+        _widen(bounds, rows, columns, x1, y1)
+    _widen(bounds, rows, columns, x0, y0)
     for i in range(len(hits)):
         px = pose[0] + c * hits[i, 0] - s * hits[i, 1]
         py = pose[1] + s * hits[i, 0] + c * hits[i, 1]
@@ -171,7 +182,7 @@ def insert(log_odds, index, surfels, count, bounds, resolution, pose, hits, clea
             continue
         log_odds[v, u] = min(LIMIT, log_odds[v, u] + HIT)
         k = index[v, u]
-        if k > 0 and int(surfels[k, X] * inv + half_u) == u and int(surfels[k, Y] * inv + half_v) == v:
+        if k > 0 and _is_at(surfels, k, u, v, inv, half_u, half_v):
             n = min(surfels[k, N] + 1.0, MAX_HITS)
             w = 1.0 / n
             surfels[k, N] = n

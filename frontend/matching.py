@@ -176,6 +176,16 @@ def match(log_odds, index, surfels, resolution, hits, start, prior, information,
     return fit, near, free, log_likelihood
 
 
+@njit(cache=True, nogil=True)
+def _near(peak, x, y, theta, step_xy, step_theta):  # type: ignore[no-untyped-def]
+    """Whether a pose of the lattice is within two steps of a peak."""
+    return (
+        abs(peak[0] - x) <= 2.01 * step_xy
+        and abs(peak[1] - y) <= 2.01 * step_xy
+        and abs(peak[2] - theta) <= 2.01 * step_theta
+    )
+
+
 @njit(cache=True, nogil=True, fastmath=True)
 def search(log_odds, index, surfels, resolution, hits, centre, reach_xy, step_xy, reach_theta, step_theta, information, stride, peaks, scores):  # type: ignore[no-untyped-def]  # noqa: E501  # fmt: skip
     """Correlative search: score all poses of a lattice around ``centre`` and keep the best local ones.
@@ -237,26 +247,22 @@ def search(log_odds, index, surfels, resolution, hits, centre, reach_xy, step_xy
                     continue
                 x = centre[0] + e0
                 y = centre[1] + e1
-                # A neighbour of a kept peak either replaces it or is dropped.
-                place = -1
+                # A neighbour of a better peak is dropped; its own neighbours that are worse are.
                 beaten = False
                 for k in range(found):
-                    if (
-                        abs(peaks[k, 0] - x) <= 2.01 * step_xy
-                        and abs(peaks[k, 1] - y) <= 2.01 * step_xy
-                        and abs(peaks[k, 2] - theta) <= 2.01 * step_theta
-                    ):
-                        if scores[k] >= score:
-                            beaten = True
-                        else:
-                            place = k
+                    if scores[k] >= score and _near(peaks[k], x, y, theta, step_xy, step_theta):
+                        beaten = True
                         break
                 if beaten:
                     continue
-                if place < 0:
-                    if found < size:
-                        found += 1
-                    place = found - 1
+                kept = 0
+                for k in range(found):
+                    if not _near(peaks[k], x, y, theta, step_xy, step_theta):
+                        peaks[kept] = peaks[k]
+                        scores[kept] = scores[k]
+                        kept += 1
+                found = min(kept + 1, size)
+                place = found - 1
                 while place > 0 and scores[place - 1] < score:
                     scores[place] = scores[place - 1]
                     peaks[place] = peaks[place - 1]

@@ -131,7 +131,7 @@ def points_of(scan: LaserScan, sensing_range: float, max_beams: int) -> Points:
     The surface fit sees all beams. ``sensing_range`` in metres is the paper's d_s.
     """
     beams = len(scan.ranges)
-    stride = -(-beams // max_beams)
+    stride = max(1, -(-beams // max_beams))
     hits = np.empty((beams, 4), np.float32)
     clear = np.empty((beams, 2), np.float32)
     n, m = _points(scan.ranges, scan.laser.angles, scan.laser.mount, sensing_range, stride, hits, clear)

@@ -92,10 +92,10 @@ def _propose(log_odds, index, surfels, resolution, hits, priors, variances, inde
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _insert_all(log_odds, index, surfels, counts, bounds, resolution, poses, hits, clear, sensor, carve):  # type: ignore[no-untyped-def]
+def _insert_all(log_odds, index, surfels, counts, bounds, resolution, poses, hits, clear, sensor):  # type: ignore[no-untyped-def]
     for p in prange(len(poses)):
         counts[p] = insert(
-            log_odds[p], index[p], surfels[p], counts[p], bounds[p], resolution, poses[p], hits, clear, sensor, carve
+            log_odds[p], index[p], surfels[p], counts[p], bounds[p], resolution, poses[p], hits, clear, sensor
         )
 
 
@@ -209,7 +209,8 @@ class ParticleFilter:
         step = self._match(points, prior.copy(), prior, np.diag(1.0 / variances))
         off = se2.between(prior, step.pose)
         surprise = 4.5 * math.log1p(float(off @ (off / variances)) / 9.0)
-        return step, EVIDENCE * step.log_likelihood - surprise
+        # As if all of the scan were in known space: driving back into it must not look better for that alone.
+        return step, EVIDENCE * step.log_likelihood / max(step.known, 0.1) - surprise
 
     def _match(self, points: Points, start: FloatArray, prior: FloatArray, information: FloatArray) -> Step:
         m = self.leader
@@ -274,11 +275,12 @@ class ParticleFilter:
                 self._covariances, fits,
             )  # fmt: skip
             self.poses[:, 2] = se2.wrap(self.poses[:, 2])
+        # The heaviest particle survives resampling, in its place.
+        self.leader = int(np.argmax(self._log_weights))
         parents = self._resample()
         self._history.append((self.poses.copy(), parents))
         if mapping:
             self.insert(points, self.poses)
-        self.leader = int(np.argmax(self._log_weights))
         self.pose = self.poses[self.leader].copy()
         self._rest()
 
@@ -292,7 +294,7 @@ class ParticleFilter:
         m = self.maps
         _insert_all(
             m.log_odds, m.index, m.surfels, m.counts, m.bounds, m.resolution,
-            poses, points.hits, points.clear, points.sensor, True,
+            poses, points.hits, points.clear, points.sensor,
         )  # fmt: skip
 
     def _resample(self) -> npt.NDArray[np.int64]:
@@ -346,8 +348,8 @@ LOST_FIT = 0.45  # below this also far around
 MARGIN = 0.05  # by how much a searched match must beat the plain one
 OPPOSITE = np.array([-1.0, -1.0, 1.0])
 EVIDENCE = 0.2  # of a scan's log-likelihood, in telling forward from backward
-REVERSED = 16.0  # log-likelihood at which odometry is taken to have the wrong sign,
-REVERSED_SCANS = 8  # and the least number of scans that must say so
+REVERSED = 12.0  # log-likelihood at which odometry is taken to have the wrong sign,
+REVERSED_SCANS = 4  # and the least number of scans that must say so
 DISBELIEF = 0.05  # what it costs, in fit, to contradict odometry e times more
 
 

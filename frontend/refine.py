@@ -99,8 +99,26 @@ def _smooth(poses, matched, hessians, motions, variances, out):  # type: ignore[
 
 
 @njit(cache=True, nogil=True)
-def _draw(log_odds, index, surfels, count, bounds, resolution, hits, ends, clear, clear_ends, sensor, poses):  # type: ignore[no-untyped-def]
+def _far_from(known, resolution, pose, hits, out):  # type: ignore[no-untyped-def]
+    """Copy the hits that no surfel of the ``known`` index is near; returns how many."""
+    rows, columns = known.shape
+    c = math.cos(pose[2])
+    s = math.sin(pose[2])
+    n = 0
+    for i in range(len(hits)):
+        u = int((pose[0] + c * hits[i, 0] - s * hits[i, 1]) / resolution + 0.5 * columns)
+        v = int((pose[1] + s * hits[i, 0] + c * hits[i, 1]) / resolution + 0.5 * rows)
+        if u < 0 or v < 0 or u >= columns or v >= rows or known[v, u] == 0:
+            out[n] = hits[i]
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _draw(log_odds, index, surfels, count, bounds, resolution, hits, ends, clear, clear_ends, sensor, poses, known):  # type: ignore[no-untyped-def]  # noqa: E501
+    """Draw scans taken at ``poses``; with a ``known`` index (else of size 0) only what is far from its surfels."""
     last = -1
+    new = np.empty_like(hits[: ends.max() if known.size else 0])
     for i in range(len(poses)):
         if last >= 0:
             dx = poses[i, 0] - poses[last, 0]
@@ -112,21 +130,29 @@ def _draw(log_odds, index, surfels, count, bounds, resolution, hits, ends, clear
         last = i
         first = ends[i - 1] if i else 0
         clear_first = clear_ends[i - 1] if i else 0
+        scan = hits[first : ends[i]]
+        if known.size:
+            scan = new[: _far_from(known, resolution, poses[i], scan, new)]
         count = insert(
             log_odds, index, surfels, count, bounds, resolution, poses[i],
-            hits[first : ends[i]], clear[clear_first : clear_ends[i]], sensor, True,
+            scan, clear[clear_first : clear_ends[i]], sensor,
         )  # fmt: skip
     return count
 
 
-def _drawn(base: Maps | None, packed: "_Packed", poses: FloatArray, parameters: FilterParameters) -> Maps:
+def _drawn(
+    base: Maps | None, packed: "_Packed", poses: FloatArray, parameters: FilterParameters, only_new: bool = False
+) -> Maps:
     maps = Maps.empty(1, parameters.map_width, parameters.resolution)
+    known = np.empty((0, 0), np.uint16)
     if base is not None:
         maps.copy_from(base, np.zeros(1, np.int64))
+        if only_new:
+            known = base.index[0]
     m = maps
     m.counts[0] = _draw(
         m.log_odds[0], m.index[0], m.surfels[0], m.counts[0], m.bounds[0], m.resolution,
-        packed.hits, packed.ends, packed.clear, packed.clear_ends, packed.sensor, poses,
+        packed.hits, packed.ends, packed.clear, packed.clear_ends, packed.sensor, poses, known,
     )  # fmt: skip
     return maps
 
@@ -161,7 +187,8 @@ def refine(
     """
     packed = _Packed(points)
     origin = poses[0]
-    maps = _drawn(base, packed, poses, parameters)
+    # What is known already is not drawn at first: a visit that began a little off would agree with itself.
+    maps = _drawn(base, packed, poses, parameters, only_new=True)
     for _ in range(ROUNDS):
         matched, hessians = _matches(maps, packed, poses, parameters)
         poses = _smoothed(matched, hessians, increments, variances)

@@ -38,11 +38,11 @@ def look(plan: FloorPlan, poses: FloatArray, laser: LaserModel = LMS200, sensing
     return [points_of(scan_of(r, laser), sensing_range, 181) for r in ranges]
 
 
-def insert(maps: Maps, points: Points, pose: FloatArray, carve: bool = True) -> None:
+def insert(maps: Maps, points: Points, pose: FloatArray) -> None:
     """Add a scan to map 0 of a stack."""
     maps.counts[0] = grid.insert(
         *layers(maps)[:3], maps.counts[0], maps.bounds[0], maps.resolution,
-        pose, points.hits, points.clear, points.sensor, carve,
+        pose, points.hits, points.clear, points.sensor,
     )  # fmt: skip
 
 

@@ -178,7 +178,6 @@ def test_search_agrees_with_brute_force(near_border: bool) -> None:
             assert (scores[(steps < 4.1).all(axis=1)] >= score - 1e-9).any()
 
 
-@pytest.mark.xfail(strict=True, reason="a better pose replaces one neighbouring peak and leaves the others")
 def test_peaks_of_a_search_are_apart() -> None:
     """None of them stands for the same place as another."""
     maps = room()[2]
