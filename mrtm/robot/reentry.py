@@ -5,6 +5,7 @@ stays as it is, until a stretch of driving has shown that the map explains what 
 agree. Only then does the vertex count as re-entered; else the trial is undone.
 """
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +23,8 @@ from mrtm.robot.topology import Vertex
 
 SUBMAP_SCANS = 12  # taken together to confirm a re-entry
 APART = 0.25  # metres between two places that are not the same
+SAME = 0.12  # metres within which two poses are of the same place
+TRUST = 4.0  # growth of the gate with the lead of the best place
 CHECK_DISTANCE = 0.5  # metres driven between two attempts to confirm
 LIMIT = 3.0  # trial distances after which there must be a verdict
 HOPELESS = 0.2  # a fit so far below what is asked for ends the trial at once
@@ -120,12 +123,13 @@ class Trial:
         if self.distance < self.next_check and not last:
             return None, reason
         self.next_check = self.distance + CHECK_DISTANCE
-        confirmed, numbers = self._confirm(slam, p)
-        reason = f"{reason}, {numbers}"
-        if not confirmed:
+        lead, off = self._confirm(slam, p)
+        reason = f"{reason}, leads by {lead:.2f}, {off:.2f} m off"
+        if lead < p.trial_lead or off > SAME:
             return (False, f"may be elsewhere: {reason}") if last else (None, reason)
         _, surprise = innovation(self.candidate.estimate, self.entered(slam))
-        if surprise > p.gate:
+        # The more a place stands out, the less the joint map, which may have slipped, has a say.
+        if surprise > p.gate * (1.0 + TRUST * lead):
             return False, f"contradicts the joint map: chi2 {surprise:.0f}, {reason}"
         return True, reason
 
@@ -133,11 +137,15 @@ class Trial:
         """The robot's pose in the old vertex at the scan where the trial began."""
         return UncertainPose(pose_of(slam.path()[0]), slam.covariance())
 
-    def _confirm(self, slam: LocalSlam, p: TopologyParameters) -> tuple[bool, str]:
+    def _confirm(self, slam: LocalSlam, p: TopologyParameters) -> tuple[float, float]:
         """Search the whole of the projected covariance again, with all that the trial has seen so far as one scan.
 
-        One scan may fit in many places where a stretch of them fits in one. False: it does not fit where the particles
-        are, or nearly as well elsewhere; where it clearly fits elsewhere, the trial starts again from there.
+        One scan may fit in many places where a stretch of them fits in one. Where it clearly fits elsewhere than where
+        the particles are, the trial starts again from there.
+
+        Returns:
+            by how much the best place beats all others, in fraction of endpoints explained, and how far the particles are
+            from it, metres.
         """
         path = slam.path()
         guess = compose(self.candidate.estimate, exactly(se2.between(path[0], path[-1])))
@@ -146,14 +154,14 @@ class Trial:
             known, slam.submap(SUBMAP_SCANS), array_of(guess.pose), guess.covariance, slam.parameters
         )
         if not len(poses):
-            return False, "fits nowhere"
+            return 0.0, math.inf
         offsets = se2.between(poses[0], poses)
         elsewhere = scores[np.hypot(offsets[:, 0], offsets[:, 1]) > APART]
         lead = float(scores[0] - elsewhere[0]) if len(elsewhere) else 1.0
         off = float(np.hypot(*se2.between(path[-1], poses[0])[:2]))
-        if lead >= p.trial_lead and off > 0.5 * APART:
+        if lead >= p.trial_lead and off > SAME:
             self._restart(slam, se2.compose(poses[0], se2.between(path[-1], path[0])))
-        return lead >= p.trial_lead and off <= 0.5 * APART, f"leads by {lead:.2f}, {off:.2f} m off"
+        return lead, off
 
     def _restart(self, slam: LocalSlam, start: FloatArray) -> None:
         """Take the scans so far again, the first of them at ``start``."""
