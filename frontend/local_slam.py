@@ -8,7 +8,7 @@ from frontend import motion, se2
 from frontend.grid import Maps
 from frontend.parameters import FilterParameters
 from frontend.points import Points, merge
-from frontend.rbpf import ParticleFilter, Step
+from frontend.rbpf import REVERSED, ParticleFilter, Step
 from frontend.records import FloatArray
 from frontend.refine import refine
 
@@ -91,7 +91,7 @@ class LocalSlam:
         step = self.filter.track(points, increment)
         offset = se2.between(self.filter.poses[self.filter.leader], step.pose)
         # While it is open which way the robot drives, drawing waits a little.
-        patience = PATIENCE if self.filter.doubt > 0.0 else 1.0
+        patience = PATIENCE if self.filter.doubt > 0.5 * REVERSED else 1.0
         if np.hypot(offset[0], offset[1]) >= patience * p.key_distance or abs(offset[2]) >= patience * p.key_angle:
             self._update(points)
             offset = np.zeros(3)

@@ -348,7 +348,7 @@ LOST_FIT = 0.45  # below this also far around
 MARGIN = 0.05  # by how much a searched match must beat the plain one
 OPPOSITE = np.array([-1.0, -1.0, 1.0])
 EVIDENCE = 0.2  # of a scan's log-likelihood, in telling forward from backward
-REVERSED = 12.0  # log-likelihood at which odometry is taken to have the wrong sign,
+REVERSED = 16.0  # log-likelihood at which odometry is taken to have the wrong sign,
 REVERSED_SCANS = 4  # and the least number of scans that must say so
 DISBELIEF = 0.05  # what it costs, in fit, to contradict odometry e times more
 

@@ -46,8 +46,13 @@ class TopologyParameters(Section):
         0.15
     )
     gate: Annotated[
-        float, Parameter("", "chi2 of a re-entry against the joint map above which it is refused", gt=0)
-    ] = 25.0
+        float,
+        Parameter(
+            "",
+            "chi2 of a re-entry against the joint map above which it is refused; more where the place stands out",
+            gt=0,
+        ),
+    ] = 12.0
     trial_lead: Annotated[float, Parameter("", "by which one place must beat all others", ge=0, le=1)] = 0.05
 
 

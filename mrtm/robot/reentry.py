@@ -24,7 +24,7 @@ from mrtm.robot.topology import Vertex
 SUBMAP_SCANS = 12  # taken together to confirm a re-entry
 APART = 0.25  # metres between two places that are not the same
 SAME = 0.12  # metres within which two poses are of the same place
-TRUST = 4.0  # growth of the gate with the lead of the best place
+TRUST = 8.0  # growth of the gate with the lead of the best place
 CHECK_DISTANCE = 0.5  # metres driven between two attempts to confirm
 LIMIT = 3.0  # trial distances after which there must be a verdict
 HOPELESS = 0.2  # a fit so far below what is asked for ends the trial at once
