@@ -1,5 +1,6 @@
 """Runs a whole process and measures what it took."""
 
+import contextlib
 import json
 import os
 import signal
@@ -52,6 +53,8 @@ def measure(command: Sequence[str], output: Path, limit: float) -> Cost:
             raise ProcessError(f"stopped after {limit:g} s") from error
         raise
     if launcher.returncode < 0:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(launcher.pid, signal.SIGKILL)  # what it had started, if that still runs
         raise ProcessError(f"killed by signal {-launcher.returncode}, with what had started it")
     if launcher.returncode > 0:
         raise ProcessError(f"{command[0]}: cannot be run ({complaint.strip().splitlines()[-1]})")
