@@ -77,7 +77,10 @@ class _Loader(yaml.SafeLoader):
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
         try:
-            return super().construct_object(node, deep)
+            value = super().construct_object(node, deep)
+            if isinstance(value, int):
+                str(value)  # fails for 5000 hexadecimal digits too, which Python reads and cannot print
+            return value
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             # What PyYAML lets through: 2001-99-99, an integer of 5000 digits, !!int without one.
             kind = node.tag.rpartition(":")[2]

@@ -20,7 +20,7 @@ from tools.bench.peers import PEERS
 from tools.bench.plot import draw
 from tools.bench.process import ProcessError
 from tools.bench.stages import profile, stages_report
-from tools.bench.suite import run_log, warm_up
+from tools.bench.suite import LogReport, run_log, warm_up
 from tools.bench.systems import Mrtm, System
 from tools.bench.table import differences, report
 from tools.simulation import BUILDINGS
@@ -77,13 +77,16 @@ def _compare(
             if system is mrtm:
                 raise ProcessError(f"mrtm on the demo log: {failure}")
             typer.echo(f"{system.name} on the demo log: {failure}", err=True)
-    reports = [run_log(log, systems, runs, peer_runs, limit, lambda line: typer.echo(line, err=True)) for log in logs]
     default = Config().model_dump(mode="json")
-    config = next((one.config for report in reports for one in report.outcomes if one.config), default)
-    table, picture = _names(out, here.day.isoformat(), "benchmark")
     anchors = read_anchors()
-    draw(reports, anchors, picture, note)
-    table.write_text(report(here, reports, systems, anchors, list(differences(config, default)), note, picture.name))
+    table, picture = _names(out, here.day.isoformat(), "benchmark")
+    reports: list[LogReport] = []
+    for log in logs:  # written anew after each log: a benchmark takes long, and what it has should not be lost
+        reports.append(run_log(log, systems, runs, peer_runs, limit, lambda line: typer.echo(line, err=True)))
+        config = next((one.config for done in reports for one in done.outcomes if one.config), default)
+        differing = list(differences(config, default))
+        draw(reports, anchors, picture, note)
+        table.write_text(report(here, reports, systems, anchors, differing, note, picture.name))
     return table
 
 

@@ -19,7 +19,7 @@ from frontend.errors import LogError
 from frontend.readers.lines import Unreadable
 from frontend.readers.mrpt_archive import Archive, EndOfArchive, known
 from frontend.readers.report import Report
-from frontend.readers.scans import RawScan, Record, assemble, wrap
+from frontend.readers.scans import FARTHEST_ODOMETRY, RawScan, Record, assemble, wrap
 from frontend.readers.track import OdometryTrack
 from frontend.records import FloatArray, Odometry
 
@@ -228,6 +228,8 @@ def _scan(archive: Archive, number: int, version: int, frame_time: int) -> tuple
         ranges, valid = ranges[::-1], valid[::-1]
     start, step = _fan(aperture, beams)
     mount = np.array([position[0], position[1], wrap(float(np.arctan2(rotation[1, 0], rotation[0, 0])))])
+    if not np.all(np.abs(mount) < FARTHEST_ODOMETRY):  # written so that NaN fails
+        raise Unreadable("the laser's place on the robot is not finite")
     return label, RawScan(
         laser=label.decode("ascii", "replace")[:40] if label.isalnum() else "laser",
         line=number,

@@ -22,7 +22,13 @@ def _positive_definite(covariance: tuple[_Three, _Three, _Three]) -> tuple[_Thre
     return covariance
 
 
-_Robot = Annotated[str, Field(pattern=r"^[^/\x00]+$")]  # its files are named after it
+def _file_name(robot: str) -> str:
+    if not robot.isprintable() or "/" in robot or not robot:
+        raise ValueError("not a name for a file, as a robot's must be")
+    return robot
+
+
+_Robot = Annotated[str, AfterValidator(_file_name)]
 _Name = tuple[_Robot, int]
 _Covariance = Annotated[tuple[_Three, _Three, _Three], AfterValidator(_positive_definite)]
 

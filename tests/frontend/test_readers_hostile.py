@@ -208,3 +208,14 @@ def test_a_monstrous_number_anywhere_warns_nobody(tmp_path: Path, content: bytes
         for at in range(0, len(fields), 7):
             hostile = b" ".join([*fields[:at], number, *fields[at + 1 :]])
             holds(Target("log", [], read_log), written(tmp_path / "log", hostile))
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), 1e300])
+@pytest.mark.parametrize("content", LOGS["MRPT rawlog"])
+def test_a_monstrous_number_in_binary_warns_nobody(tmp_path: Path, content: bytes, number: float) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for at in range(len(content)):
+            for value in (struct.pack("<d", number), struct.pack("<f", min(number, 3e38))):
+                hostile = content[:at] + value + content[at + len(value) :]
+                holds(Target("log", [], read_log), written(tmp_path / "log", hostile))

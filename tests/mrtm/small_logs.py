@@ -41,6 +41,14 @@ def office_ring(laps: int = 1, seed: int = 1, laser: LaserModel = LMS200) -> Sim
 
 
 @cache
+def there_and_back() -> SimulatedLog:
+    """Along two sides of the office ring and back the same way."""
+    plan = office(1, 24.0, 20.0)
+    start, corner, end = plan.routes["ring"][:3]
+    return simulate(replace(plan, routes={"back": [start, corner, end, corner, start]}), "back", seed=1)
+
+
+@cache
 def hotel_visit(seed: int, slips: float) -> SimulatedLog:
     """Into five rooms that are exactly alike, 4 m apart along a corridor, and back into three of them."""
     rooms, pitch = 5, 4.0

@@ -136,6 +136,7 @@ def test_bounds_hold_without_the_configuration() -> None:
     [
         ("seed: 2001-99-99", "'2001-99-99' is not a valid timestamp"),
         (f"seed: {'9' * 5000}", f"'{'9' * 39}... is not a valid int"),
+        (f"seed: 0x{'9' * 5000}", f"'0x{'9' * 37}... is not a valid int"),
         (f"seed: 1{'0' * 400}", "seed is 1000"),
         (f"frontend: {{sigma: 1{'0' * 400}}}", "frontend.sigma is 1000"),
         ("seed: !!int ''", "'' is not a valid int"),

@@ -294,6 +294,7 @@ def test_truth_must_name_robots_of_the_run(tmp_path: Path) -> None:
         (("robots", "robot"), {}),
         (("robots",), {}),
         (("robots",), {"../../robot": {"component": 0}}),
+        (("robots",), {"a\u2028b": {"component": 0}}),
         (("components", 0), []),
         (("vertices", 0, "id"), ["robot"]),
         (("vertices", 0, "first_scan", "pose"), [1, 2]),

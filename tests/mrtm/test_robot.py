@@ -30,8 +30,9 @@ from tests.mrtm.small_logs import (
     ring,
     room,
     small,
+    there_and_back,
 )
-from tools.simulation import OdometryNoise, SimulatedLog
+from tools.simulation import LMS200, OdometryNoise, SimulatedLog
 
 JUMP = 150  # the scan at which something goes wrong
 
@@ -239,6 +240,26 @@ def test_m5_an_edge_that_is_travelled_again_gets_a_new_version(laps: RunResult) 
         assert sample.distance < 0.15, sample.name
 
 
+def test_m5_an_edge_may_be_travelled_against_its_direction() -> None:
+    log = there_and_back()
+    result = mapped(log)
+    check_complete(log, result)
+    entered = [event.detail["vertex"] for event in result.events if event.kind == "re-entered"]
+    fused = [edge for edge in accepted(result) if edge.kind is EdgeKind.COVARIANCE_INTERSECTION]
+    assert any(str(edge.tail) in entered for edge in fused)
+    for sample in edge_errors(log, result):
+        assert sample.distance < 0.15, sample.name
+    assert errors(log, result).rmse < 0.05
+
+
+def test_m8_a_loop_edge_is_measured_again_when_the_visit_it_began_is_over(laps: RunResult) -> None:
+    versions = {(fate.edge.id, fate.edge.version): fate.edge for fate in laps.edges}
+    loops = [edge for edge in versions.values() if edge.kind is EdgeKind.LOOP and edge.version == 1]
+    assert loops
+    for edge in loops:
+        assert not edge.measurement.equals(versions[edge.id, 0].measurement, 1e-12)
+
+
 def test_m5_the_weight_of_the_new_estimate_is_omega() -> None:
     """With 0 an edge stays what it was; with 1 it becomes what was measured last."""
     log = ring(2)
@@ -278,7 +299,7 @@ def test_a_loop_bends_the_trajectory_into_shape() -> None:
 
 
 @pytest.mark.parametrize("slips", [0.0, 6.0])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
 def test_rooms_that_look_alike_are_not_taken_for_each_other(seed: int, slips: float) -> None:
     log = hotel_visit(seed, slips)
     result = mapped(log)
@@ -332,6 +353,14 @@ def test_a_long_visit_is_closed_and_goes_on() -> None:
     assert errors(log, result).rmse < 0.05
 
 
+def test_closing_a_map_on_the_way_makes_nobody_surer() -> None:
+    log = office_ring(1, laser=replace(LMS200, rate=15.0))
+    results = [mapped(log, small("frontend.travel_square=14", f"topology.longest_visit={n}")) for n in (100, 1500)]
+    assert kinds(results[0])["left vertex"] > kinds(results[1])["left vertex"]
+    closed, whole = (np.sqrt(np.linalg.det(accepted(result)[0].covariance)) for result in results)
+    assert closed > 0.6 * whole
+
+
 def test_a_robot_that_stands_still_stays_where_it_is() -> None:
     log = room()
     scans = [replace(scan, odometry=np.zeros(3)) for scan in log.scans()]
@@ -343,11 +372,10 @@ def test_a_robot_that_stands_still_stays_where_it_is() -> None:
 
 
 def test_wheel_slips_are_survived() -> None:
-    for seed in (1, 2):
-        log = ring(2, seed, OdometryNoise(slips_per_minute=6))
-        result = mapped(log)
-        check_complete(log, result)
-        assert errors(log, result).rmse < 0.1
+    log = ring(2, 2, OdometryNoise(slips_per_minute=6))
+    result = mapped(log)
+    check_complete(log, result)
+    assert errors(log, result).rmse < 0.1
 
 
 @pytest.mark.parametrize("seed", [1, 2])

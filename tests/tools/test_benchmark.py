@@ -194,6 +194,8 @@ def test_a_process_is_measured_by_itself(tmp_path: Path) -> None:
     [
         (["no-such-program-anywhere"], 60, "cannot be run"),
         ([sys.executable, "-c", "raise SystemExit('it is broken')"], 60, "code 1: it is broken"),
+        ([sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"], 60, "killed by signal 9"),
+        ([sys.executable, "-c", "import os; os.kill(os.getppid(), 9)"], 60, "killed by signal 9, with"),
         ([sys.executable, "-c", "import time; time.sleep(60)"], 1, "stopped after 1 s"),
     ],
 )

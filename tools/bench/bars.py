@@ -46,7 +46,7 @@ def draw_day(day: Day, path: Path, note: str = "") -> None:
     right.set_ylabel("memory, MB")
     for axes in (left, right):
         axes.set_xlabel("hour")
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.1 * axes.get_ylim()[1])
         axes.grid(True, color="#e1e5ea", linewidth=0.6)
     figure.suptitle(f"{day.building}{f' ({note})' if note else ''}", fontsize=9, color=INK)
     figure.savefig(path, dpi=150)

@@ -1,5 +1,6 @@
 """Runs a whole process and measures what it took."""
 
+import contextlib
 import json
 import os
 import signal
@@ -51,10 +52,16 @@ def measure(command: Sequence[str], output: Path, limit: float) -> Cost:
         if isinstance(error, subprocess.TimeoutExpired):
             raise ProcessError(f"stopped after {limit:g} s") from error
         raise
-    if launcher.returncode != 0:
+    if launcher.returncode < 0:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(launcher.pid, signal.SIGKILL)  # what it had started, if that still runs
+        raise ProcessError(f"killed by signal {-launcher.returncode}, with what had started it")
+    if launcher.returncode > 0:
         raise ProcessError(f"{command[0]}: cannot be run ({complaint.strip().splitlines()[-1]})")
     code, wall, cpu, memory = json.loads(said)
-    if code != 0:
+    if code < 0:
+        raise ProcessError(f"killed by signal {-code}")
+    if code > 0:
         lines = output.read_text(errors="replace").strip().splitlines()
         raise ProcessError(f"ended with code {code}: {lines[-1][:160] if lines else 'it said nothing'}")
     return Cost(wall, cpu, memory / (1e6 if sys.platform == "darwin" else 1e3))  # bytes there, kilobytes elsewhere
