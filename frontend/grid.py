@@ -148,7 +148,7 @@ def _carve(log_odds, index, surfels, resolution, x0, y0, x1, y1, short):  # type
 
 @njit(cache=True, nogil=True)
 def insert(log_odds, index, surfels, count, bounds, resolution, pose, hits, clear, sensor):  # type: ignore[no-untyped-def]
-    """Add one scan taken at ``pose`` to a map: the cells that its beams passed become freer, those that they hit fuller.
+    """Add one scan taken at ``pose`` to a map: cells that its beams passed become freer, those that they hit fuller.
 
     Returns the new number of surfels. ``bounds`` is widened in place.
     """

@@ -109,7 +109,8 @@ class Step:
         known: fraction of all endpoints that lie in known space.
         log_likelihood: of the scan, relative to that of a perfect fit.
         searched: 0 if the plain match was good; 1 or 2 for a search around or far around the expected pose.
-        reversed: odometry was found to drive the other way than it says, from here on.
+        reversed: odometry was found to have changed its sign,
+        forward: and whether it has the right one now.
     """
 
     pose: FloatArray
@@ -118,6 +119,7 @@ class Step:
     log_likelihood: float
     searched: int = 0
     reversed: bool = False
+    forward: bool = True
 
 
 class ParticleFilter:
@@ -173,8 +175,8 @@ class ParticleFilter:
     def track(self, points: Points, increment: FloatArray) -> Step:
         """Follow the best particle over one odometry ``increment`` (3,) by matching ``points`` to its map.
 
-        Public logs have stretches of reverse driving recorded as forward, or the other way round. So a second track runs
-        along under the opposite sign; where it has explained the scans better for a while, it becomes the first.
+        Public logs have stretches of reverse driving recorded as forward, or the other way round. So a second track
+        runs along under the opposite sign; where it has explained the scans better for a while, it becomes the first.
         """
         increment = increment * self._sign
         added = motion.variance(increment, self.parameters.motion)
@@ -193,7 +195,7 @@ class ParticleFilter:
             step = mirrored
         if len(points.hits) >= MIN_POINTS and not _good(step):
             step = self._search(points, se2.compose(self.pose, increment), increment, step)
-        step.reversed = turned_over
+        step.reversed, step.forward = turned_over, bool(self._sign[0] > 0.0)
         self.pose = step.pose
         if self.doubt == 0.0:
             self._mirror, self._mirror_motion = step.pose, self._motion
@@ -350,7 +352,7 @@ OPPOSITE = np.array([-1.0, -1.0, 1.0])
 EVIDENCE = 0.2  # of a scan's log-likelihood, in telling forward from backward
 REVERSED = 16.0  # log-likelihood at which odometry is taken to have the wrong sign,
 REVERSED_SCANS = 4  # and the least number of scans that must say so
-DISBELIEF = 0.05  # what it costs, in fit, to contradict odometry e times more
+DISBELIEF = 0.08  # what it costs, in fit, to contradict odometry e times more
 
 
 def _good(step: Step) -> bool:

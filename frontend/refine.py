@@ -115,7 +115,7 @@ def _far_from(known, resolution, pose, hits, out):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True)
-def _draw(log_odds, index, surfels, count, bounds, resolution, hits, ends, clear, clear_ends, sensor, poses, known):  # type: ignore[no-untyped-def]  # noqa: E501
+def _draw(log_odds, index, surfels, count, bounds, resolution, hits, ends, clear, clear_ends, sensor, poses, known):  # type: ignore[no-untyped-def]
     """Draw scans taken at ``poses``; with a ``known`` index (else of size 0) only what is far from its surfels."""
     last = -1
     new = np.empty_like(hits[: ends.max() if known.size else 0])

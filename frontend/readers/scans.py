@@ -203,12 +203,12 @@ def _largest_below(ranges: FloatArray, limit: float) -> float:
 
 
 def _masked(ranges: FloatArray, max_range: float, report: Report) -> npt.NDArray[np.float32]:
-    usable = ranges > 0.0  # false for NaN
     far = ranges >= max_range - 1e-3
+    masked = np.clip(ranges, 0.0, FARTHEST_WALL).astype(np.float32)  # 1e300 has no float32, 1e-97 is zero in it
+    usable = masked > 0.0  # false for NaN
     count = np.count_nonzero(usable)
     report.readings += ranges.size
     report.no_returns += int(np.count_nonzero(far))
-    masked = np.clip(ranges, 0.0, FARTHEST_WALL).astype(np.float32)  # 1e300 has no float32
     masked[far] = np.inf
     if count < ranges.size:
         report.masked += ranges.size - int(count)

@@ -144,8 +144,8 @@ class Trial:
         the particles are, the trial starts again from there.
 
         Returns:
-            by how much the best place beats all others, in fraction of endpoints explained, and how far the particles are
-            from it, metres.
+            by how much the best place beats all others, in fraction of endpoints explained, and how far the particles
+            are from it, metres.
         """
         path = slam.path()
         guess = compose(self.candidate.estimate, exactly(se2.between(path[0], path[-1])))

@@ -90,7 +90,7 @@ class Robot:
         if step.searched:
             self._tell("searched wider", level=step.searched, fit=step.fit, known=step.known)
         if step.reversed:
-            self._tell("odometry reversed")
+            self._tell("odometry reversed", forward="as recorded" if step.forward else "recorded as backward")
         outside = float(np.max(np.abs(step.pose[:2]))) / self._half_width  # M4
         if self._trial is not None:
             self._trial.add(step, increment)

@@ -114,14 +114,6 @@ def test_bounds_hold_all_that_was_touched(pose: tuple[float, float, float]) -> N
     outside_bounds_is_blank(maps)
 
 
-def test_without_carving_only_hits_count() -> None:
-    maps = Maps.empty(1, 6.0, RESOLUTION)
-    insert(maps, scan(np.array([[1.01, 0.52], [1.01, 0.53], [-2.0, 0.3]]), np.array([[2.0, 2.0]])), np.zeros(3))
-    assert (maps.log_odds != 0).sum() == 2
-    assert sorted(maps.log_odds[maps.log_odds != 0]) == [grid.HIT, 2 * grid.HIT]
-    outside_bounds_is_blank(maps)
-
-
 def test_log_odds_stay_within_their_limits() -> None:
     maps = Maps.empty(1, 6.0, RESOLUTION)
     for _ in range(40):
