@@ -23,6 +23,8 @@ from frontend.records import LaserScan
 from tools.fuzzing.seeds import LOGS
 from tools.fuzzing.targets import Target, holds, read_log
 
+pytestmark = pytest.mark.slow  # thousands of damaged inputs
+
 COMPRESS: dict[str, Callable[[bytes], bytes]] = {
     "plain": bytes,
     "gzip": gzip.compress,

@@ -19,6 +19,8 @@ from tools.fuzzing import seeds
 from tools.fuzzing.mutate import LARGEST, mutate
 from tools.fuzzing.targets import Target, targets
 
+pytestmark = pytest.mark.slow  # thousands of damaged inputs
+
 ROOT = Path(__file__).parents[2]
 TARGETS = {target.name: target for target in targets()}
 
