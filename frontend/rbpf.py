@@ -183,24 +183,26 @@ class ParticleFilter:
         self._variances += added
         step, merit = self._follow(points, self.pose, increment, added)
         self._motion = se2.compose(self._motion, increment)
-        opposite = increment * OPPOSITE
-        mirrored, mirrored_merit = self._follow(points, self._mirror, opposite, added)
-        self._mirror_motion = se2.compose(self._mirror_motion, opposite)
-        # One scan proves little: its time may be off by a good part of the way driven.
-        self.doubt = max(0.0, self.doubt + min(mirrored_merit - merit, REVERSED / REVERSED_SCANS))
-        turned_over = self.doubt >= REVERSED
-        if turned_over:
-            self._sign = self._sign * OPPOSITE
-            self._motion, self.doubt = self._mirror_motion, 0.0
-            step = mirrored
+        turned_over = False
+        if abs(increment[0]) + abs(increment[1]) < STILL:
+            self._mirror = se2.compose(self._mirror, increment)
+            self._mirror_motion = se2.compose(self._mirror_motion, increment)
+        else:
+            mirrored, mirrored_merit = self._follow(points, self._mirror, increment * OPPOSITE, added)
+            self._mirror, self._mirror_motion = mirrored.pose, se2.compose(self._mirror_motion, increment * OPPOSITE)
+            # One scan proves little: its time may be off by a good part of the way driven.
+            self.doubt = max(0.0, self.doubt + min(mirrored_merit - merit, REVERSED / REVERSED_SCANS))
+            turned_over = self.doubt >= REVERSED
+            if turned_over:
+                self._sign = self._sign * OPPOSITE
+                self._motion, self.doubt = self._mirror_motion, 0.0
+                step = mirrored
         if len(points.hits) >= MIN_POINTS and not _good(step):
             step = self._search(points, se2.compose(self.pose, increment), increment, step)
         step.reversed, step.forward = turned_over, bool(self._sign[0] > 0.0)
         self.pose = step.pose
         if self.doubt == 0.0:
             self._mirror, self._mirror_motion = step.pose, self._motion
-        else:
-            self._mirror = mirrored.pose
         return step
 
     def _follow(
@@ -349,6 +351,7 @@ GOOD_KNOWN = 0.25  # that has less than this in known space, is searched around
 LOST_FIT = 0.45  # below this also far around
 MARGIN = 0.05  # by how much a searched match must beat the plain one
 OPPOSITE = np.array([-1.0, -1.0, 1.0])
+STILL = 0.005  # metres: a robot that moves less between two scans has no direction
 EVIDENCE = 0.2  # of a scan's log-likelihood, in telling forward from backward
 REVERSED = 16.0  # log-likelihood at which odometry is taken to have the wrong sign,
 REVERSED_SCANS = 4  # and the least number of scans that must say so
