@@ -108,6 +108,7 @@ class Step:
         fit: fraction of the endpoints in known space that the map explains, 0 to 1.
         known: fraction of all endpoints that lie in known space.
         log_likelihood: of the scan, relative to that of a perfect fit.
+        hessian: (3, 3) information of the scan on the pose, map coordinates.
         searched: 0 if the plain match was good; 1 or 2 for a search around or far around the expected pose.
         reversed: odometry was found to have changed its sign,
         forward: and whether it has the right one now.
@@ -117,6 +118,7 @@ class Step:
     fit: float
     known: float
     log_likelihood: float
+    hessian: FloatArray
     searched: int = 0
     reversed: bool = False
     forward: bool = True
@@ -142,6 +144,7 @@ class ParticleFilter:
         self.pose = np.zeros(3)
         self.doubt = 0.0  # log-likelihood by which the opposite sign explains the last scans better
         self._sign = np.ones(3)
+        self._unsure = 0.0  # metres driven under the opposite sign since a scan last spoke for it
         self._mirror = np.zeros(3)
         self._mirror_motion = np.zeros(3)
 
@@ -190,10 +193,15 @@ class ParticleFilter:
         else:
             mirrored, mirrored_merit = self._follow(points, self._mirror, increment * OPPOSITE, added)
             self._mirror, self._mirror_motion = mirrored.pose, se2.compose(self._mirror_motion, increment * OPPOSITE)
-            # One scan proves little: its time may be off by a good part of the way driven.
-            self.doubt = max(0.0, self.doubt + min(mirrored_merit - merit, REVERSED / REVERSED_SCANS))
-            turned_over = self.doubt >= REVERSED
+            # One scan proves little: its time may be off by a good part of the way driven. Nor does a bare corridor.
+            evidence = _grip(step, increment) * (mirrored_merit - merit)
+            self.doubt = max(0.0, self.doubt + min(evidence, REVERSED / REVERSED_SCANS))
+            # A wrong sign is the exception: it is held only as long as the scans go on saying so.
+            held = self._sign[0] < 0.0 and evidence > -1.0
+            self._unsure = self._unsure + float(np.hypot(increment[0], increment[1])) if held else 0.0
+            turned_over = self.doubt >= REVERSED or self._unsure > HOLD
             if turned_over:
+                self._unsure = 0.0
                 self._sign = self._sign * OPPOSITE
                 self._motion, self.doubt = self._mirror_motion, 0.0
                 step = mirrored
@@ -218,13 +226,14 @@ class ParticleFilter:
 
     def _match(self, points: Points, start: FloatArray, prior: FloatArray, information: FloatArray) -> Step:
         m = self.leader
+        hessian = np.empty((3, 3))
         fit, near, free, log_likelihood = match(
             self.maps.log_odds[m], self.maps.index[m], self.maps.surfels[m], self.maps.resolution,
-            points.hits, start, prior, information, self.parameters.sigma, np.empty((3, 3)),
+            points.hits, start, prior, information, self.parameters.sigma, hessian,
         )  # fmt: skip
         known = near + free
         start[2] = se2.wrap(start[2])
-        return Step(start, fit / max(1, known), known / max(1, len(points.hits)), log_likelihood)
+        return Step(start, fit / max(1, known), known / max(1, len(points.hits)), log_likelihood, hessian)
 
     def _search(self, points: Points, prior: FloatArray, increment: FloatArray, best: Step) -> Step:
         """The match is poor: odometry may be wrong. Look around, and if that does not help, far around.
@@ -351,6 +360,8 @@ GOOD_KNOWN = 0.25  # that has less than this in known space, is searched around
 LOST_FIT = 0.45  # below this also far around
 MARGIN = 0.05  # by how much a searched match must beat the plain one
 OPPOSITE = np.array([-1.0, -1.0, 1.0])
+HOLD = 0.7  # metres driven under the opposite sign without a scan that speaks for it, after which it is given up
+NO_GRIP, FULL_GRIP = 0.01, 0.06  # share of a scan's information that lies along the way driven
 STILL = 0.005  # metres: a robot that moves less between two scans has no direction
 EVIDENCE = 0.2  # of a scan's log-likelihood, in telling forward from backward
 REVERSED = 16.0  # log-likelihood at which odometry is taken to have the wrong sign,
@@ -360,3 +371,12 @@ DISBELIEF = 0.08  # what it costs, in fit, to contradict odometry e times more
 
 def _good(step: Step) -> bool:
     return step.fit >= GOOD_FIT and step.known >= GOOD_KNOWN
+
+
+def _grip(step: Step, increment: FloatArray) -> float:
+    """How well a scan tells the place along the way driven, 0 (a bare corridor) to 1."""
+    heading = float(step.pose[2]) + math.atan2(increment[1], increment[0])
+    along = np.array([math.cos(heading), math.sin(heading)])
+    information = step.hessian[:2, :2]
+    share = float(along @ information @ along) / max(float(np.trace(information)), 1e-9)
+    return min(1.0, max(0.0, (share - NO_GRIP) / (FULL_GRIP - NO_GRIP)))

@@ -151,7 +151,7 @@ class Slam:
         self.start.append(poses[0])
 
     def add(self, points: None, increment: FloatArray) -> Step:
-        return Step(np.zeros(3), 0.9, 0.9, -10.0)
+        return Step(np.zeros(3), 0.9, 0.9, -10.0, np.eye(3))
 
 
 def trial(fits: list[float], knowns: list[float] | float = 0.9, metres: float = 0.3) -> Trial:
@@ -159,7 +159,7 @@ def trial(fits: list[float], knowns: list[float] | float = 0.9, metres: float = 
     projected = UncertainPose(gtsam.Pose2(1.0, 0.0, 0.0), np.diag([0.1, 0.1, 0.05]) ** 2)
     result = Trial(Candidate(vertex, projected), UncertainPose(gtsam.Pose2(), SURE), 0, resume=False)
     for fit, known in zip(fits, knowns if isinstance(knowns, list) else [knowns] * len(fits), strict=True):
-        result.add(Step(np.zeros(3), fit, known, -10.0), np.array([metres, 0.0, 0.0]))
+        result.add(Step(np.zeros(3), fit, known, -10.0, np.eye(3)), np.array([metres, 0.0, 0.0]))
     return result
 
 
@@ -187,7 +187,7 @@ def test_a_trial_adds_up_what_it_saw() -> None:
     assert (t.fits, t.knowns) == ([0.9, 0.8], [0.7, 0.6])
     assert t.distance == pytest.approx(1.0)
     before = t.distance
-    t.add(Step(np.zeros(3), 0.9, 0.9, -10.0), np.array([0.0, 0.0, -1.0]))
+    t.add(Step(np.zeros(3), 0.9, 0.9, -10.0, np.eye(3)), np.array([0.0, 0.0, -1.0]))
     assert t.distance > before  # turning on the spot shows a place, too
 
 
@@ -219,7 +219,7 @@ def waits_until_the_limit(t: Trial, sigma: float = 0.01) -> str:
     assert verdict(t, sigma, leaving=True)[0] is False
     fit, known, driven = t.fits[-1], t.knowns[-1], 0.0
     while (outcome := verdict(t, sigma))[0] is None:
-        t.add(Step(np.zeros(3), fit, known, -10.0), np.array([0.4, 0.0, 0.0]))
+        t.add(Step(np.zeros(3), fit, known, -10.0, np.eye(3)), np.array([0.4, 0.0, 0.0]))
         driven += 0.4
         assert driven < 10.0 * P.trial_distance, "never comes to a verdict"
     assert driven > 0.0
