@@ -48,6 +48,8 @@ def _means(axes: Axes, found: dict[tuple[str, str], list[Sample]], kinds: list[s
                 axes.plot(v.mean, y, "o", color=colour, markersize=5, label=name if row == 0 else None)
                 axes.plot(v.median / 0.789, y, "|", color=colour, markersize=9)
     axes.set(xscale="log", xlabel="NEES / 3: mean (dot), 95 % by bootstrap over runs (line), median / 0.79 (tick)")
+    low, high = axes.get_xlim()
+    axes.set_xlim(min(low, 0.1), max(high, 10.0))
     axes.set_yticks(range(len(kinds)), [kind.replace("_", "\n") for kind in kinds])
     axes.invert_yaxis()
     axes.legend(loc="best", fontsize=8)
@@ -61,7 +63,7 @@ def _distributions(axes: Axes, found: dict[tuple[str, str], list[Sample]], kinds
         label = f"{kind.replace('_', ' ')} ({len(values)})"
         axes.step(values, np.arange(1, len(values) + 1) / len(values), color=colour, label=label)
     axes.set(xscale="log", xlim=(0.01, 100), ylim=(0, 1), xlabel="NEES / 3", ylabel="fraction below")
-    axes.legend(loc="upper left", fontsize=8)
+    axes.legend(loc="lower right", fontsize=8)
 
 
 def _components(axes: Axes, found: dict[tuple[str, str], list[Sample]], kinds: list[str]) -> None:
@@ -79,4 +81,6 @@ def _components(axes: Axes, found: dict[tuple[str, str], list[Sample]], kinds: l
     ticks = [*names, "along\ncorridor", "across\ncorridor"]
     axes.set_xticks(range(len(ticks)), ticks)
     axes.set(yscale="log", ylabel="rms of error / sigma (above 1: over-confident)")
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, 0.1), max(high, 10.0))
     axes.legend(loc="best", fontsize=8)
