@@ -9,6 +9,7 @@ Random numbers are hashed from (seed, step, particle), so the result does not de
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -382,3 +383,9 @@ def _grip(step: Step, increment: FloatArray) -> float:
     information = step.hessian[:2, :2]
     share = float(along @ information @ along) / max(float(np.trace(information)), 1e-9)
     return min(1.0, max(0.0, (share - NO_GRIP) / (FULL_GRIP - NO_GRIP)))
+
+
+def first_run() -> bool:
+    """Whether the filter's kernels are still to be compiled on this machine."""
+    cache = _propose.stats.cache_path
+    return cache is None or not any(Path(cache).glob("rbpf._propose*.nbi"))

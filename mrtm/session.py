@@ -1,6 +1,6 @@
 """A run: logs in, joint map out."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ from factors import VertexId
 from frontend import se2
 from frontend.grid import UNIT, N, X
 from frontend.local_map import Grid, LocalMap
+from frontend.rbpf import first_run
 from frontend.readers import open_log
 from frontend.records import LaserScan
 from mrtm.config import Config
@@ -21,6 +22,8 @@ from mrtm.robot.robot import Robot
 from mrtm.robot.topology import Vertex
 from mrtm.timing import Stages
 
+MAPPING = 0.95  # of the time a run takes; the rest goes into writing
+
 
 def run_log(path: Path, out: Path, config: Config, progress: Progress) -> RunResult:
     """Map one robot's log and write what a run leaves behind.
@@ -31,14 +34,31 @@ def run_log(path: Path, out: Path, config: Config, progress: Progress) -> RunRes
         LogError: the log cannot be read or holds no usable scan.
     """
     log = open_log(path)
-    result = map_scans(log.scans(), config, progress, path.name.split(".")[0])
+    if first_run():
+        progress(0.0, "compiling the kernels, which only the first run does")
+
+    def report(scans: int, vertices: int) -> None:
+        progress(MAPPING * log.report.fraction, f"{scans} scans, {vertices} vertices")
+
+    result = map_scans(log.scans(), config, report, path.name.split(".")[0])
+    progress(MAPPING, "writing")
     result.blemishes.extend(log.report.blemishes())
     export(result, out)
+    progress(1.0, f"{result.counts['scans']} scans, {result.counts['vertices']} vertices")
     return result
 
 
-def map_scans(scans: Iterable[LaserScan], config: Config, progress: Progress, name: str = "robot") -> RunResult:
-    """Map one robot's scans; nothing is written."""
+def map_scans(
+    scans: Iterable[LaserScan],
+    config: Config,
+    report: Callable[[int, int], None] = lambda scans, vertices: None,
+    name: str = "robot",
+) -> RunResult:
+    """Map one robot's scans; nothing is written.
+
+    Args:
+        report: told now and then how many scans have been taken and how many vertices there are.
+    """
     stages = Stages()
     graphs: list[JointGraph] = []
     events: list[Event] = []
@@ -56,7 +76,7 @@ def map_scans(scans: Iterable[LaserScan], config: Config, progress: Progress, na
             break
         robot.process(scan)
         if len(robot.times) % 100 == 0:
-            progress(0.5, f"{len(robot.times)} scans, {len(robot.topology.vertices)} vertices")
+            report(len(robot.times), len(robot.topology.vertices))
     robot.finish()
     graph = graphs[0]
     with stages("joint map"):

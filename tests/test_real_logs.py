@@ -21,7 +21,7 @@ CHI2_999 = 16.27
 def run(log: Path) -> tuple[RunResult, dict[str, TimedPoses]]:
     if not log.exists():
         pytest.skip(f"no {log}")
-    result = map_scans(open_log(log).scans(), load_config(), lambda fraction, doing: None)
+    result = map_scans(open_log(log).scans(), load_config())
     return result, {name: TimedPoses(t.times, t.poses) for name, t in result.trajectories.items()}
 
 

@@ -3,6 +3,7 @@
 import bz2
 import gzip
 import lzma
+import os
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -41,6 +42,7 @@ def read_blocks(path: Path, report: Report) -> Iterator[bytes]:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from error
     with file:
         start = file.read(6)
+        size = file.seek(0, os.SEEK_END)
         file.seek(0)
         opener = next((opener for magic, opener in _OPENERS.items() if start.startswith(magic)), None)
         stream = file if opener is None else cast(IO[bytes], opener(file, "rb"))
@@ -57,6 +59,7 @@ def read_blocks(path: Path, report: Report) -> Iterator[bytes]:
             if not block:
                 return
             done += len(block)
+            report.fraction = file.tell() / size if size else 1.0
             yield block
 
 

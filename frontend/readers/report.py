@@ -29,6 +29,7 @@ class Report:
         masked: of these, unusable ones (NaN, negative, zero).
         no_returns: of these, ones that hit nothing.
         first_time, last_time: least and greatest time of a scan, seconds, the log's own clock; NaN without a scan.
+        fraction: how much of the file has been read, 0 to 1.
         damage: how a compressed or unreadable file ended early; empty if it did not.
     """
 
@@ -48,6 +49,7 @@ class Report:
     no_returns: int = 0
     first_time: float = float("nan")
     last_time: float = float("nan")
+    fraction: float = 0.0
     damage: str = ""
 
     @property

@@ -97,7 +97,7 @@ def kidnapped(log: SimulatedLog, at: int, back: int) -> SimulatedLog:
 
 def mapped(log: SimulatedLog, config: Config | None = None, scans: Iterable[LaserScan] | None = None) -> RunResult:
     """The run over a log, or over ``scans`` made from it."""
-    return map_scans(log.scans() if scans is None else scans, config or small(), lambda fraction, doing: None)
+    return map_scans(log.scans() if scans is None else scans, config or small())
 
 
 def poses(result: RunResult) -> FloatArray:

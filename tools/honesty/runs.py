@@ -124,7 +124,7 @@ def simulated(plan: str, seed: int, laps: int, options: Sequence[str] = ()) -> H
     points = building.route(route)
     closed = np.allclose(points[0, :2], points[-1, :2])
     log = simulate(building, route, noise=OdometryNoise(), seed=seed, laps=laps if closed else 1)
-    result = map_scans(log.scans(), load_config(options=[f"seed={seed}", *options]), lambda fraction, doing: None)
+    result = map_scans(log.scans(), load_config(options=[f"seed={seed}", *options]))
     (robot,) = result.trajectories
     truth, estimate = {robot: TimedPoses(log.times, log.poses)}, result.trajectories[robot]
     ate = evaluate_ate(truth, {robot: TimedPoses(estimate.times, estimate.poses)})
@@ -140,7 +140,7 @@ def simulated(plan: str, seed: int, laps: int, options: Sequence[str] = ()) -> H
 def logged(path: Path, options: Sequence[str] = ()) -> Honesty:
     """Map a real log; only its innovations can be told."""
     config = load_config(options=options)
-    result = map_scans(open_log(path).scans(), config, lambda fraction, doing: None)
+    result = map_scans(open_log(path).scans(), config)
     return Honesty(path.name, config.seed, float("nan"), [], _innovations(result.events, path.name, config.seed))
 
 
