@@ -24,7 +24,7 @@ class TopologyParameters(Section):
     projection: Annotated[
         Literal["joint", "dijkstra"],
         Parameter("", "where M6 takes the pose in a known vertex from: joint estimate or shortest path", "dijkstra"),
-    ] = "dijkstra"
+    ] = "joint"
     omega: Annotated[float, Parameter("", "weight of the new estimate in M5", paper="0.5", ge=0, le=1)] = 0.5
     reach: Annotated[
         float, Parameter("", "standard deviations a pose may lie outside a square in M6", paper="0", ge=0)
