@@ -250,7 +250,7 @@ class ParticleFilter:
         def merit(step: Step) -> float:
             off = se2.between(prior, step.pose)
             surprise = math.log1p(float(off @ (off / noise)) / 9.0)
-            return step.fit * step.known + UNKNOWN * (1.0 - step.known) - DISBELIEF * surprise
+            return step.fit * step.known - DISBELIEF * surprise
 
         for level, (reach_xy, reach_theta) in enumerate(
             ((0.3 + 0.5 * moved, 0.2 + 0.3 * turned), (1.0 + 2.0 * moved, 0.6 + 0.5 * turned)), start=1
@@ -368,7 +368,6 @@ STILL = 0.005  # metres: a robot that moves less between two scans has no direct
 EVIDENCE = 0.2  # of a scan's log-likelihood, in telling forward from backward
 REVERSED = 16.0  # log-likelihood at which odometry is taken to have the wrong sign,
 REVERSED_SCANS = 4  # and the least number of scans that must say so
-UNKNOWN = 0.4  # fit that an endpoint in unknown space counts for: else sliding back into known space would win
 DISBELIEF = 0.08  # what it costs, in fit, to contradict odometry e times more
 
 
