@@ -32,7 +32,8 @@ class LocalMap:
         scans: (n,) indices of the scans taken in this vertex, into the robot's log, ascending.
         times: (n,) their times, seconds.
         poses: (n, 3) local_T_robot at each of them.
-        cloud: (m, 2) centres of the occupied cells, metres.
+        cloud: (m, 2) points of surfaces, at most one a cell, metres.
+        normals: (m, 2) their unit normals, towards where they were seen from; zero where none is known.
     """
 
     grid: Grid
@@ -40,3 +41,4 @@ class LocalMap:
     times: FloatArray
     poses: FloatArray
     cloud: FloatArray
+    normals: FloatArray

@@ -7,7 +7,7 @@ import numpy as np
 
 from factors import VertexId
 from frontend import se2
-from frontend.grid import UNIT, N, X
+from frontend.grid import NX, NY, UNIT, N, X, Y
 from frontend.local_map import Grid, LocalMap
 from frontend.rbpf import first_run
 from frontend.readers import open_log
@@ -122,13 +122,17 @@ def _local_map(vertex: Vertex, times: np.ndarray) -> LocalMap:
         maps.resolution,
         (np.array([c0, r0]) - 0.5 * cells) * maps.resolution,
     )
-    surfels = maps.surfels[0, 1 : maps.counts[0]]
-    order = np.argsort(vertex.scans, kind="stable")
-    scans = np.array(vertex.scans, np.int64)[order]
+    surfels = maps.surfels[0, 1 : maps.counts[0]].astype(np.float64)
+    surfels = surfels[surfels[:, N] > 0]
+    normals = surfels[:, NX : NY + 1]
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    # A visit that was resumed has the scan of the seam twice.
+    scans, order = np.unique(np.array(vertex.scans, np.int64), return_index=True)
     return LocalMap(
         grid,
         scans,
         times[scans],
         np.array(vertex.poses)[order],
-        surfels[surfels[:, N] > 0, X : X + 2].astype(np.float64),
+        surfels[:, X : Y + 1],
+        np.where(lengths > 0.5, normals / np.maximum(lengths, 0.5), 0.0),
     )

@@ -19,7 +19,7 @@ def local_map_name(vertex: VertexId) -> str:
 
 def write_local_map(path: Path, local_map: LocalMap) -> None:
     """Write a local map: ``log_odds`` (int8 in steps of ``unit``), ``resolution``, ``origin``, ``scans``, ``times``,
-    ``poses``, ``cloud``, as in :class:`frontend.local_map.LocalMap`."""
+    ``poses``, ``cloud``, ``normals``, as in :class:`frontend.local_map.LocalMap`."""
     grid = local_map.grid
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
@@ -31,7 +31,8 @@ def write_local_map(path: Path, local_map: LocalMap) -> None:
             scans=local_map.scans,
             times=local_map.times,
             poses=local_map.poses,
-            cloud=local_map.cloud.astype(np.float32),  # cell centres: a micrometre will do
+            cloud=local_map.cloud.astype(np.float32),  # a micrometre will do
+            normals=local_map.normals.astype(np.float32),
         )
 
 
@@ -41,4 +42,5 @@ def read_local_map(path: Path) -> LocalMap:
         grid = Grid(
             data["log_odds"].astype(np.float32) * np.float32(data["unit"]), float(data["resolution"]), data["origin"]
         )
-        return LocalMap(grid, data["scans"], data["times"], data["poses"], data["cloud"].astype(np.float64))
+        cloud, normals = data["cloud"].astype(np.float64), data["normals"].astype(np.float64)
+        return LocalMap(grid, data["scans"], data["times"], data["poses"], cloud, normals)

@@ -35,6 +35,7 @@ def local_map(pose: gtsam.Pose2, first: int, times: FloatArray, poses: FloatArra
         times,
         np.array([[p.x(), p.y(), p.theta()] for p in local]),
         np.column_stack([centres[columns], centres[rows]]),
+        np.tile([0.0, 1.0], (len(rows), 1)),
     )
 
 

@@ -127,6 +127,7 @@ def test_local_maps_come_back(out: Path) -> None:
     for name in ("scans", "times", "poses"):
         np.testing.assert_array_equal(getattr(read, name), getattr(wrote, name))
     np.testing.assert_allclose(read.cloud, wrote.cloud, atol=1e-6)
+    np.testing.assert_allclose(read.normals, wrote.normals, atol=1e-6)
 
 
 def test_the_same_run_gives_the_same_bytes(out: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ RESOLUTION = 0.05
 def local_map(log_odds: npt.ArrayLike, origin: tuple[float, float] = (0.0, 0.0)) -> LocalMap:
     none = np.empty((0, 3))
     grid = Grid(np.array(log_odds, np.float32), RESOLUTION, np.array(origin))
-    return LocalMap(grid, np.empty(0, np.int64), np.empty(0), none, np.empty((0, 2)))
+    return LocalMap(grid, np.empty(0, np.int64), np.empty(0), none, np.empty((0, 2)), np.empty((0, 2)))
 
 
 def wall_seen_from_the_left(column: int, size: int = 80) -> Log:

@@ -89,9 +89,8 @@ def a_run(measured: gtsam.Pose2, truth: FloatArray) -> RunResult:
     covariance = np.diag([0.01, 0.01, 0.001])
 
     def local(scans: list[int], first: FloatArray) -> LocalMap:
-        return LocalMap(
-            grid, np.array(scans), np.array(scans, float), np.tile(first, (len(scans), 1)), np.empty((0, 2))
-        )
+        poses, none = np.tile(first, (len(scans), 1)), np.empty((0, 2))
+        return LocalMap(grid, np.array(scans), np.array(scans, float), poses, none, none)
 
     def edge(version: int, kind: EdgeKind) -> Edge:
         return Edge(EdgeId("r", 0), version, kind, a, b, measured, covariance)
