@@ -126,8 +126,9 @@ def _local_map(vertex: Vertex, times: np.ndarray) -> LocalMap:
     surfels = surfels[surfels[:, N] > 0]
     normals = surfels[:, NX : NY + 1]
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    # A visit that was resumed has the scan of the seam twice.
-    scans, order = np.unique(np.array(vertex.scans, np.int64), return_index=True)
+    # A visit that was resumed has the scan of the seam twice; the later pose is the one that had the whole map.
+    scans, order = np.unique(np.array(vertex.scans, np.int64)[::-1], return_index=True)
+    order = len(vertex.scans) - 1 - order
     return LocalMap(
         grid,
         scans,
