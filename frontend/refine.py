@@ -1,8 +1,8 @@
 """What a finished local map can still give to the poses it was made of.
 
 Inside a vertex a pose is only as good as the filter was at that time, with half a map. Once the map is whole, every
-scan is matched against it again and the matches are tied together by odometry, the map is drawn anew from the better
-poses, and so on.
+scan is matched against it again and the matches are tied together by odometry; then poses and map are adjusted together,
+and the map is drawn anew from the better poses.
 """
 
 import math
@@ -11,13 +11,14 @@ import numpy as np
 from numba import njit, prange
 
 from frontend import se2
+from frontend.adjust import Adjusted, adjust
 from frontend.grid import Maps, insert
 from frontend.matching import match
 from frontend.parameters import FilterParameters
 from frontend.points import Points
 from frontend.records import FloatArray
 
-ROUNDS = 2  # of drawing the map and matching against it
+ROUNDS = 1  # of drawing the map and matching against it
 LEASH = np.diag([1.0 / 0.05**2, 1.0 / 0.05**2, 1.0 / 0.03**2])  # information that keeps a match near where it starts
 TAIL = 9.0  # squared Mahalanobis distance at which odometry has half its weight
 SMOOTHING_STEPS = 3  # Gauss-Newton steps
@@ -171,7 +172,7 @@ class _Packed:
 def refine(
     points: list[Points], poses: FloatArray, increments: FloatArray, variances: FloatArray, base: Maps | None,
     parameters: FilterParameters,
-) -> tuple[FloatArray, Maps]:  # fmt: skip
+) -> tuple[Adjusted, Maps]:  # fmt: skip
     """Better poses for the scans of one visit to a vertex, and the vertex's map drawn from them.
 
     Args:
@@ -183,7 +184,7 @@ def refine(
             first pose keeps its place.
 
     Returns:
-        (n, 3) poses and the map, a stack of one.
+        poses with their covariances in the map as it was, or from the first pose on, and the new map, a stack of one.
     """
     packed = _Packed(points)
     origin = poses[0]
@@ -194,9 +195,11 @@ def refine(
         poses = _smoothed(matched, hessians, increments, variances)
         if base is None:
             poses = se2.compose(origin, se2.between(poses[0], poses))
-        maps = _drawn(base, packed, poses, parameters)
+        maps = _drawn(base, packed, poses, parameters, only_new=True)
     poses[:, 2] = se2.wrap(poses[:, 2])
-    return poses, maps
+    known = 0 if base is None else int(base.counts[0])
+    adjusted = adjust(packed.hits, packed.ends, poses, increments, variances, maps, known, parameters.sigma)
+    return adjusted, _drawn(base, packed, adjusted.poses, parameters)
 
 
 def _matches(

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId, compose, inverse
+from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId, adjoint_transport, compose, inverse
 from frontend.grid import Maps
 from frontend.records import FloatArray
 from mrtm.result import EdgeFate
+from mrtm.robot.poses import pose_of
 
 
 @dataclass(slots=True)
@@ -20,6 +21,8 @@ class Vertex:
         id: name.
         maps: what is known of the place (a stack of one), as the last visit left it; None during the first visit.
         spread: (3, 3) covariance of the particles when the robot last left.
+        places: poses (k, 3) from which the map was made, and
+        covariances: (k, 3, 3) how well each is known in the frame of the vertex, each in its own tangent frame.
         scans: indices of the robot's scans taken here, in the order they came.
         poses: local_T_robot (3,) at each of them.
     """
@@ -27,8 +30,20 @@ class Vertex:
     id: VertexId
     maps: Maps | None = None
     spread: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    places: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    covariances: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
     scans: list[int] = field(default_factory=list)
     poses: list[FloatArray] = field(default_factory=list)
+
+    def uncertain(self, pose: FloatArray, covariance: FloatArray) -> UncertainPose:
+        """A pose (3,) that is known to ``covariance`` (3, 3) in the map, with the map's own error around it added: that of
+        the nearest pose that the map was made from."""
+        measured = UncertainPose(pose_of(pose), covariance)
+        if not len(self.places):
+            return measured
+        nearest = int(np.argmin(np.hypot(*(self.places[:, :2] - pose[:2]).T)))
+        moved = measured.pose.inverse().compose(pose_of(self.places[nearest]))
+        return UncertainPose(measured.pose, covariance + adjoint_transport(moved, self.covariances[nearest]))
 
 
 class Topology:
