@@ -35,6 +35,7 @@ PINNED = 1e10  # information that holds the first pose
 LOOSE = 1e-4  # information every pose has of its own, against singular systems
 TAIL = 9.0  # squared Mahalanobis distance at which odometry has half its weight
 WALL = 0.5  # metres to both sides over which a wall's direction is found
+STRAIGHT = 0.75  # length of the mean normal of a surfel that is of one wall
 PARALLEL = 0.8  # cosine between normals, and
 FLAT = 0.03  # metres off the line, within which surfels are of one wall
 PATCH = 0.5  # metres of wall and
@@ -74,7 +75,7 @@ def _normals(index, surfels, count, resolution, out):  # type: ignore[no-untyped
     for k in range(1, count):
         out[k] = 0.0
         length = math.sqrt(surfels[k, NX] ** 2 + surfels[k, NY] ** 2)
-        if surfels[k, N] <= 0.0 or length <= COHERENCE:
+        if surfels[k, N] <= 0.0 or length <= STRAIGHT:
             continue
         nx = surfels[k, NX] / length
         ny = surfels[k, NY] / length

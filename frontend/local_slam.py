@@ -11,7 +11,7 @@ from frontend.parameters import FilterParameters
 from frontend.points import Points, merge
 from frontend.rbpf import REVERSED, ParticleFilter, Step
 from frontend.records import FloatArray
-from frontend.refine import refine
+from frontend.refine import localise, refine
 
 PATIENCE = 2.5  # times the usual distance between key scans
 SOFTNESS = 0.06  # difference of two scores that makes one hypothesis e times likelier than the other
@@ -121,12 +121,24 @@ class LocalSlam:
             self._update(self._points[-1])
             self._offsets[-1] = np.zeros(3)
             self._keys[-1] = self._steps
-        increments = np.array(self._increments)
-        variances = np.array([motion.variance(i, self.parameters.motion) for i in increments])
+        increments, variances = self._odometry()
         a, maps = refine(self._points, self.path(), increments, variances, self._base, self.parameters)
         _, spread = self.filter.pose_and_covariance()
         since = self._steps - self._resampled
         return Visit(a.poses, a.chosen, a.covariances, a.sigma, spread, maps, since)
+
+    def entrance(self) -> tuple[FloatArray, FloatArray]:
+        """Pose (3,) of the visit's first scan in the known map, as all scans so far tell it, and its covariance (3, 3)
+        there, in its tangent frame."""
+        assert self._base is not None
+        increments, variances = self._odometry()
+        a = localise(self._points, self.path(), increments, variances, self._base, self.parameters)
+        return a.poses[0], a.covariances[0]
+
+    def _odometry(self) -> tuple[FloatArray, FloatArray]:
+        """(n, 3) increments and their variances."""
+        increments = np.array(self._increments)
+        return increments, np.array([motion.variance(i, self.parameters.motion) for i in increments])
 
     def covariance(self) -> FloatArray:
         """(3, 3) of the robot's pose in the vertex so far, in the robot's tangent frame.

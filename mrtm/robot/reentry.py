@@ -135,7 +135,7 @@ class Trial:
 
     def entered(self, slam: LocalSlam) -> UncertainPose:
         """The robot's pose in the old vertex at the scan where the trial began."""
-        return self.candidate.vertex.uncertain(slam.path()[0], slam.covariance())
+        return self.candidate.vertex.uncertain(*slam.entrance())
 
     def _confirm(self, slam: LocalSlam, p: TopologyParameters) -> tuple[float, float]:
         """Search the whole of the projected covariance again, with all that the trial has seen so far as one scan.

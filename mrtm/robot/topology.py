@@ -6,11 +6,15 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
-from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId, adjoint_transport, compose, inverse
+from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId, compose, inverse
+from frontend import se2
 from frontend.grid import Maps
 from frontend.records import FloatArray
 from mrtm.result import EdgeFate
 from mrtm.robot.poses import pose_of
+
+
+NEAR = 2.0  # metres: poses of a map nearer than this all tell the same about its error
 
 
 @dataclass(slots=True)
@@ -36,14 +40,23 @@ class Vertex:
     poses: list[FloatArray] = field(default_factory=list)
 
     def uncertain(self, pose: FloatArray, covariance: FloatArray) -> UncertainPose:
-        """A pose (3,) that is known to ``covariance`` (3, 3) in the map, with the map's own error around it added: that of
-        the nearest pose that the map was made from."""
-        measured = UncertainPose(pose_of(pose), covariance)
+        """A pose (3,) that is known to ``covariance`` (3, 3) in the map, with the map's own error as seen from it added.
+
+        What is seen was drawn from all the poses the map was made from: their covariances, carried here, are averaged,
+        the nearer ones counting more.
+        """
         if not len(self.places):
-            return measured
-        nearest = int(np.argmin(np.hypot(*(self.places[:, :2] - pose[:2]).T)))
-        moved = measured.pose.inverse().compose(pose_of(self.places[nearest]))
-        return UncertainPose(measured.pose, covariance + adjoint_transport(moved, self.covariances[nearest]))
+            return UncertainPose(pose_of(pose), covariance)
+        here_T_place = se2.between(pose, self.places)
+        c, s = np.cos(here_T_place[:, 2]), np.sin(here_T_place[:, 2])
+        adjoint = np.zeros((len(c), 3, 3))
+        adjoint[:, 0, 0] = adjoint[:, 1, 1] = c
+        adjoint[:, 0, 1], adjoint[:, 1, 0] = -s, s
+        adjoint[:, 0, 2], adjoint[:, 1, 2] = here_T_place[:, 1], -here_T_place[:, 0]
+        adjoint[:, 2, 2] = 1.0
+        weights = 1.0 / (NEAR**2 + (here_T_place[:, :2] ** 2).sum(axis=1))
+        carried = adjoint @ self.covariances @ np.transpose(adjoint, (0, 2, 1))
+        return UncertainPose(pose_of(pose), covariance + np.average(carried, axis=0, weights=weights))
 
 
 class Topology:
