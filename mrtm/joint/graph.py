@@ -25,7 +25,7 @@ from mrtm.joint.smoother import Smoother
 FloatArray = npt.NDArray[np.float64]
 
 # chi2 of 3 degrees of freedom, 99.9 %: an edge that the present uncertainty explains this well pulls at once.
-_INNOVATION_GATE = 16.27
+_INNOVATION_GATE = 30.0
 
 
 class GraphError(ValueError):
