@@ -20,7 +20,7 @@ from numba import njit
 
 from frontend import se2
 from frontend.grid import NX, NY, N, X, Y, Maps
-from frontend.matching import COHERENCE, CORE, FACING, LAST_GATE
+from frontend.matching import CORE, FACING, LAST_GATE
 from frontend.records import FloatArray
 
 IntArray = npt.NDArray[np.int64]
@@ -31,19 +31,21 @@ MOST_POSES = 120  # or more, if they would be more than this
 ROUNDS = 3  # Gauss-Newton steps
 SETTLED = 5e-4  # metres and radians: no further step if no pose moved more
 DAMPING = 1.0 / 0.1**2  # information that keeps each step near where it starts
-PINNED = 1e10  # information that holds the first pose
+PINNED = 1e8  # information that holds the first pose
 LOOSE = 1e-4  # information every pose has of its own, against singular systems
 TAIL = 9.0  # squared Mahalanobis distance at which odometry has half its weight
+STRAIGHT = 0.75  # length of the mean normal of a surfel that is of one wall, not of a corner
 WALL = 0.5  # metres to both sides over which a wall's direction is found
-STRAIGHT = 0.75  # length of the mean normal of a surfel that is of one wall
 PARALLEL = 0.8  # cosine between normals, and
 FLAT = 0.03  # metres off the line, within which surfels are of one wall
+LEAST_SURFELS = 4  # that make a wall
+USUAL = 50.0  # endpoints that scatter as expected, taken for granted
+INFLATION = 2.0  # of the scans' covariance for what is linearised and discretised; from simulated truth
+# What the errors of neighbouring endpoints share is found by looking together at the residuals of
 PATCH = 0.5  # metres of wall and
-SERIES = 3  # successive poses whose residuals are looked at together
+SERIES = 3  # successive poses.
 LEAST_SEEN = 4  # a surfel seen less often has no residual to speak of
-INFLATION = 2.0
-import os
-FORGETTING = float(os.environ.get('FORGET','0.3'))  # metres after which other walls with other errors are seen
+FORGETTING = 0.3  # metres driven after which such an error is another; from real logs' normalised innovations
 ARM = 5.0  # metres to the walls, at which an error turns the robot
 
 
@@ -107,7 +109,7 @@ def _normals(index, surfels, count, resolution, out):  # type: ignore[no-untyped
             sd += w * d
             saa += w * a * a
             sad += w * a * d
-        if found < 4:
+        if found < LEAST_SURFELS:
             continue
         spread = saa - sa * sa / total
         slope = (sad - sa * sd / total) / spread
@@ -371,7 +373,7 @@ def adjust(
         squares, weights, free = _reduce(
             scan[:n], surfel[:n], jacobian[:n], error[:n], weight[:n], prior, information, right
         )
-        freedom = max(1.0, weights - free - size)
+        freedom = max(0.0, weights - free - size)
         return _System(information, right, squares, freedom, surfel[:n], scan[:n], error[:n], weight[:n])
 
     def anchored(at: FloatArray, scans: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -392,11 +394,14 @@ def adjust(
         at = at + step
         if np.abs(step).max() < SETTLED:
             break
+    if not known:
+        at = se2.compose(poses[0], se2.between(at[0], at))
     s = system(at)
-    variance = s.squares / s.freedom
-    effect, common = _correlation(s, maps, int(maps.counts[0]))
+    variance = (s.squares + USUAL * sigma**2) / (s.freedom + USUAL)
+    effect = _design_effect(s, maps.surfels[0, : len(prior)].astype(np.float64))
     information, _ = anchored(at, s.scans / (INFLATION * effect * variance), s.right)
     covariances = _marginals(information, _factorise(information), at[:, 2])
+    # Of independent errors nothing is shared; the more the residuals go together, the more of them bends the map.
     covariances += _bending(at, variance * (1.0 - 1.0 / effect))
     return Adjusted(_moved(poses, chosen, at), chosen, covariances, math.sqrt(variance * effect))
 
@@ -428,28 +433,19 @@ def _bending(poses: FloatArray, common: float) -> FloatArray:
     )  # fmt: skip
 
 
-def _correlation(s: _System, maps: Maps, count: int) -> tuple[float, float]:
-    """How far residuals that are near each other in space and time go together.
-
-    Returns:
-        design effect: the variance of their sums over what it would be if they were independent, 1 or more (L. Kish,
-        "Survey Sampling", 1965); and the variance (m^2) that they share, 0 or more.
-    """
-    if not len(s.surfel):
-        return 1.0, 0.0
-    surfels = maps.surfels[0, :count].astype(np.float64)
+def _design_effect(s: _System, surfels: FloatArray) -> float:
+    """How many endpoints count as one: the variance of sums of residuals that are near each other in space and time, over
+    what it would be if they were independent (L. Kish, "Survey Sampling", 1965). 1 for independent noise."""
+    count = len(surfels)
     mean = np.bincount(s.surfel, s.weight * s.error, count) / np.maximum(np.bincount(s.surfel, s.weight, count), 1e-9)
-    w = np.where(np.bincount(s.surfel, minlength=count)[s.surfel] >= LEAST_SEEN, s.weight, 0.0)
-    r = w * (s.error - mean[s.surfel])
+    often = np.bincount(s.surfel, minlength=count)[s.surfel] >= LEAST_SEEN
+    r = np.where(often, s.weight * (s.error - mean[s.surfel]), 0.0)
     patch = np.floor(surfels[:, X] / PATCH) * 4096 + np.floor(surfels[:, Y] / PATCH)
     facing = np.round(np.arctan2(surfels[:, NY], surfels[:, NX]) / (np.pi / 4)) % 8
     key = ((patch * 8 + facing)[s.surfel] * 1000 + s.scan // SERIES).astype(np.int64)
     _, group = np.unique(key, return_inverse=True)
-    squares, sums = float((r**2).sum()), float((np.bincount(group, r) ** 2).sum())
-    pairs = float((np.bincount(group, w) ** 2).sum() - (w**2).sum())
-    if squares <= 0.0 or pairs <= 0.0:
-        return 1.0, 0.0
-    return max(1.0, sums / squares), max(0.0, (sums - squares) / pairs)
+    squares = float((r**2).sum())
+    return max(1.0, float((np.bincount(group, r) ** 2).sum()) / squares) if squares > 0.0 else 1.0
 
 
 def _choose(poses: FloatArray) -> IntArray:
