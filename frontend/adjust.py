@@ -40,12 +40,12 @@ PARALLEL = 0.8  # cosine between normals, and
 FLAT = 0.03  # metres off the line, within which surfels are of one wall
 LEAST_SURFELS = 4  # that make a wall
 USUAL = 50.0  # endpoints that scatter as expected, taken for granted
-INFLATION = 2.0  # of the scans' covariance for what is linearised and discretised; from simulated truth
+INFLATION = 1.7  # of the scans' covariance for what is linearised and discretised; from simulated truth
 # What the errors of neighbouring endpoints share is found by looking together at the residuals of
 PATCH = 0.5  # metres of wall and
 SERIES = 3  # successive poses.
 LEAST_SEEN = 4  # a surfel seen less often has no residual to speak of
-FORGETTING = 0.3  # metres driven after which such an error is another; from real logs' normalised innovations
+FORGETTING = 0.6  # metres driven after which such an error is another; from real logs' normalised innovations
 ARM = 5.0  # metres to the walls, at which an error turns the robot
 
 

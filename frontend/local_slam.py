@@ -57,6 +57,7 @@ class LocalSlam:
         self._base: Maps | None = None
         self._mapping = True
         self._entrance = np.zeros(3)
+        self._localised = np.empty((0, 3))  # poses of the first scans as ``entrance`` found them
         self._random = np.random.default_rng(seed)
 
     def begin(
@@ -75,6 +76,7 @@ class LocalSlam:
         self.filter.start(poses, known)
         self._points, self._increments = [points], [np.zeros(3)]
         self._offsets, self._keys, self._steps, self._resampled = [np.zeros(3)], [0], 0, 0
+        self._localised = np.empty((0, 3))
         if self._mapping:
             self.filter.insert(points, poses)
 
@@ -122,7 +124,9 @@ class LocalSlam:
             self._offsets[-1] = np.zeros(3)
             self._keys[-1] = self._steps
         increments, variances = self._odometry()
-        a, maps = refine(self._points, self.path(), increments, variances, self._base, self.parameters)
+        path = self.path()
+        path[: len(self._localised)] = self._localised
+        a, maps = refine(self._points, path, increments, variances, self._base, self.parameters)
         _, spread = self.filter.pose_and_covariance()
         since = self._steps - self._resampled
         return Visit(a.poses, a.chosen, a.covariances, a.sigma, spread, maps, since)
@@ -133,6 +137,7 @@ class LocalSlam:
         assert self._base is not None
         increments, variances = self._odometry()
         a = localise(self._points, self.path(), increments, variances, self._base, self.parameters)
+        self._localised = a.poses
         return a.poses[0], a.covariances[0]
 
     def _odometry(self) -> tuple[FloatArray, FloatArray]:

@@ -192,8 +192,6 @@ def refine(
     """
     packed = _Packed(points)
     origin = poses[0]
-    if base is not None:
-        poses = _without_jumps(base, packed, poses, increments, variances, parameters)
     # What is known already is not drawn at first: a visit that began a little off would agree with itself.
     maps = _drawn(base, packed, poses, parameters, only_new=True)
     for _ in range(ROUNDS):

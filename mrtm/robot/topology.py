@@ -14,7 +14,7 @@ from mrtm.result import EdgeFate
 from mrtm.robot.poses import pose_of
 
 
-NEAR = 2.0  # metres: poses of a map nearer than this all tell the same about its error
+NEAR = 3.0  # metres: poses of a map nearer than this all tell about the same of its error
 
 
 @dataclass(slots=True)
@@ -54,7 +54,7 @@ class Vertex:
         adjoint[:, 0, 1], adjoint[:, 1, 0] = -s, s
         adjoint[:, 0, 2], adjoint[:, 1, 2] = here_T_place[:, 1], -here_T_place[:, 0]
         adjoint[:, 2, 2] = 1.0
-        weights = 1.0 / (NEAR**2 + (here_T_place[:, :2] ** 2).sum(axis=1))
+        weights = 1.0 / (NEAR**2 + (here_T_place[:, :2] ** 2).sum(axis=1)) ** 2
         carried = adjoint @ self.covariances @ np.transpose(adjoint, (0, 2, 1))
         return UncertainPose(pose_of(pose), covariance + np.average(carried, axis=0, weights=weights))
 

@@ -139,3 +139,28 @@ def test_a_visit_of_one_scan(hits: int) -> None:
     assert found.covariances.shape == (1, 3, 3)
     assert isinstance(maps, Maps)
     np.testing.assert_array_equal(maps.log_odds, drawn([few], at).log_odds)
+
+
+def jumping(odometry_lies: bool) -> tuple[FloatArray, FloatArray]:
+    """True poses in the known room; the path of a robot whose first ten poses are 0.31 m off, or whose odometry once is."""
+    base = room()[2]
+    log, points, increments = drive()
+    true, increments = log.poses[:40], np.vstack([np.zeros(3), se2.between(log.poses[:39], log.poses[1:40])])
+    variances = np.array([motion.variance(i, PARAMETERS.motion) for i in increments])
+    path = true.copy()
+    if odometry_lies:
+        increments[10] += [0.31, 0.0, 0.0]
+    else:
+        path[:10] = se2.compose(np.array([0.2, -0.24, 0.0]), path[:10])
+    packed = refine._Packed(points[:40])
+    return true, refine._without_jumps(base, packed, path, increments, variances, PARAMETERS)
+
+
+def test_a_jump_in_a_known_map_is_taken_out() -> None:
+    true, path = jumping(odometry_lies=False)
+    assert np.abs(path - true)[:, :2].max() < 0.03
+
+
+def test_a_jump_of_odometry_is_not_taken_into_the_path() -> None:
+    true, path = jumping(odometry_lies=True)
+    np.testing.assert_array_equal(path, true)

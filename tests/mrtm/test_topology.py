@@ -181,3 +181,24 @@ def test_the_path_goes_along_the_present_versions(rng: np.random.Generator) -> N
     now = topology.along_shortest_paths(a.id)[b.id]
     assert now.pose.equals(moved, 1e-12)
     np.testing.assert_allclose(now.covariance, 1e-4 * np.eye(3))
+
+
+def test_the_error_of_a_map_is_that_of_the_poses_it_was_made_from() -> None:
+    vertex = Vertex(VertexId("red", 0))
+    own = np.diag([1e-4, 4e-4, 1e-5])
+    pose = np.array([5.0, 0.0, np.pi / 2])
+    np.testing.assert_array_equal(vertex.uncertain(pose, own).covariance, own)
+    vertex.places = np.array([[0.0, 0.0, 0.0]])
+    vertex.covariances = np.diag([1e-4, 2e-4, 1e-4])[None]
+    found = vertex.uncertain(pose, own)
+    assert found.pose.equals(gtsam.Pose2(5.0, 0.0, np.pi / 2), 1e-12)
+    # Five metres on, turned to the left: what was to the side is ahead, and the heading's error moves it by 5 m times that.
+    added = found.covariance - own
+    assert added[0, 0] == pytest.approx(2e-4 + 25.0 * 1e-4)
+    assert added[1, 1] == pytest.approx(1e-4)
+    assert added[2, 2] == pytest.approx(1e-4)
+    assert np.linalg.eigvalsh(added).min() > -1e-12
+    # Of two poses the nearer one counts more.
+    vertex.places = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
+    vertex.covariances = np.stack([np.diag([1e-4, 2e-4, 1e-4]), 1e-6 * np.eye(3)])
+    assert vertex.uncertain(pose, own).covariance[0, 0] - own[0, 0] < 0.3 * added[0, 0]
