@@ -2,8 +2,8 @@
 
 Matching scans against a map that is drawn from their own poses cannot see the map bend, and makes each pose look as
 certain as if the map were the truth. Here every surfel may also move, along its normal, and the poses are those that
-least squares finds for both at once: bundle adjustment with lines for points. A surfel enters linearly and is eliminated
-(Schur complement), which leaves a system of the poses alone; its inverse is their covariance, with the map's
+least squares finds for both at once: bundle adjustment with lines for points. A surfel enters linearly and is
+eliminated (Schur complement), which leaves a system of the poses alone; its inverse is their covariance, with the map's
 uncertainty in it. What two poses see in common ties them; where they see nothing in common, the chain of poses between
 them and odometry do.
 
@@ -19,7 +19,7 @@ import numpy.typing as npt
 from numba import njit
 
 from frontend import se2
-from frontend.grid import NX, NY, N, X, Y, Maps
+from frontend.grid import NX, NY, Maps, N, X, Y
 from frontend.matching import CORE, FACING, LAST_GATE
 from frontend.records import FloatArray
 
@@ -119,7 +119,7 @@ def _normals(index, surfels, count, resolution, out):  # type: ignore[no-untyped
 
 
 @njit(cache=True, nogil=True)
-def _observe(index, surfels, normals, resolution, hits, starts, ends, poses, sigma, scan, surfel, jacobian, error, weight):  # type: ignore[no-untyped-def]  # fmt: skip
+def _observe(index, surfels, normals, resolution, hits, starts, ends, poses, sigma, scan, surfel, jacobian, error, weight):  # type: ignore[no-untyped-def]  # noqa: E501  # fmt: skip
     """The endpoints that lie on a line: scan, surfel, (3,) derivative of the distance by the pose, distance, robust
     weight in units of ``1 / sigma**2``. Returns how many."""
     rows, columns = index.shape
@@ -165,7 +165,7 @@ def _observe(index, surfels, normals, resolution, hits, starts, ends, poses, sig
 
 @njit(cache=True, nogil=True)
 def _reduce(scan, surfel, jacobian, error, weight, known, information, right):  # type: ignore[no-untyped-def]
-    """Add the observations to the lower triangle of ``information`` (3m, 3m) and to ``right`` (3m,), surfels eliminated.
+    """Add observations to the lower triangle of ``information`` (3m, 3m) and to ``right`` (3m,), surfels eliminated.
 
     Everything in units of ``1 / sigma**2``. ``known`` (count,) is the information that surfels have already. Returns
     the weighted square sum of the residuals, of the robust weights, and the number of surfels that were free.
@@ -434,8 +434,11 @@ def _bending(poses: FloatArray, common: float) -> FloatArray:
 
 
 def _design_effect(s: _System, surfels: FloatArray) -> float:
-    """How many endpoints count as one: the variance of sums of residuals that are near each other in space and time, over
-    what it would be if they were independent (L. Kish, "Survey Sampling", 1965). 1 for independent noise."""
+    """How many endpoints count as one (L. Kish, "Survey Sampling", 1965); 1 for independent noise.
+
+    The variance of sums of residuals that are near each other in space and time, over what it would be if they were
+    independent.
+    """
     count = len(surfels)
     mean = np.bincount(s.surfel, s.weight * s.error, count) / np.maximum(np.bincount(s.surfel, s.weight, count), 1e-9)
     often = np.bincount(s.surfel, minlength=count)[s.surfel] >= LEAST_SEEN

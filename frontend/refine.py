@@ -1,8 +1,8 @@
 """What a finished local map can still give to the poses it was made of.
 
 Inside a vertex a pose is only as good as the filter was at that time, with half a map. Once the map is whole, every
-scan is matched against it again and the matches are tied together by odometry; then poses and map are adjusted together,
-and the map is drawn anew from the better poses.
+scan is matched against it again and the matches are tied together by odometry; then poses and map are adjusted
+together, and the map is drawn anew from the better poses.
 """
 
 import math
@@ -221,15 +221,13 @@ def localise(
         if np.abs(poses - before)[:, :2].max() < SETTLED:
             break
     poses[:, 2] = se2.wrap(poses[:, 2])
-    return adjust(
-        packed.hits, packed.ends, poses, increments, variances, known, int(known.counts[0]), parameters.sigma
-    )
+    return adjust(packed.hits, packed.ends, poses, increments, variances, known, int(known.counts[0]), parameters.sigma)
 
 
 def _matches(
     maps: Maps, packed: _Packed, poses: FloatArray, parameters: FilterParameters
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The first scans, as many as ``poses``, against the map: poses (n, 3), their informations (n, 3, 3) and fits (n,)."""
+    """The first n scans against the map: poses (n, 3), their informations (n, 3, 3) and fits (n,)."""
     matched, hessians, fits = poses.copy(), np.empty((len(poses), 3, 3)), np.empty(len(poses))
     _match_all(
         maps.log_odds[0], maps.index[0], maps.surfels[0], maps.resolution,
@@ -244,7 +242,7 @@ def _without_jumps(
 ) -> FloatArray:  # fmt: skip
     """Poses (n, 3) in a known map without the jumps of a robot that at first took itself to be a little off.
 
-    The part before a jump is moved to where odometry has it, seen from the part after it, unless the map speaks against.
+    The part before a jump is moved to where odometry has it, seen from the part after it, unless the map objects.
     """
     off = se2.between(se2.compose(poses[:-1], increments[1:]), poses[1:])
     doubtful = (np.hypot(off[:, 0], off[:, 1]) > JUMP) & ((off**2 / variances[1:]).sum(axis=1) > JUMP_CHI2)

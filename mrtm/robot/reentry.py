@@ -18,7 +18,7 @@ from frontend.rbpf import Step
 from frontend.records import FloatArray
 from frontend.relocalisation import hypotheses
 from mrtm.config import TopologyParameters
-from mrtm.robot.poses import array_of, exactly, innovation, pose_of
+from mrtm.robot.poses import array_of, exactly, innovation
 from mrtm.robot.topology import Vertex
 
 SUBMAP_SCANS = 12  # taken together to confirm a re-entry

@@ -116,7 +116,13 @@ class Robot:
         here.poses.extend(visit.poses)
         here.places = np.concatenate([here.places, visit.poses[visit.chosen]])
         here.covariances = np.concatenate([here.covariances, [c.covariance for c in chosen]])
-        self._tell("left vertex", vertex=str(here.id), scans=len(visit.poses), since_resampling=visit.since_resampling, sigma=round(visit.sigma,5))
+        self._tell(
+            "left vertex",
+            vertex=str(here.id),
+            scans=len(visit.poses),
+            since_resampling=visit.since_resampling,
+            sigma=round(visit.sigma, 5),
+        )
         self._update_edge(chosen[0])
         return chosen[-1]
 

@@ -13,7 +13,6 @@ from frontend.records import FloatArray
 from mrtm.result import EdgeFate
 from mrtm.robot.poses import pose_of
 
-
 NEAR = 3.0  # metres: poses of a map nearer than this all tell about the same of its error
 
 
@@ -40,7 +39,7 @@ class Vertex:
     poses: list[FloatArray] = field(default_factory=list)
 
     def uncertain(self, pose: FloatArray, covariance: FloatArray) -> UncertainPose:
-        """A pose (3,) that is known to ``covariance`` (3, 3) in the map, with the map's own error as seen from it added.
+        """A pose (3,) known to ``covariance`` (3, 3) in the map, with the map's own error as seen from it added.
 
         What is seen was drawn from all the poses the map was made from: their covariances, carried here, are averaged,
         the nearer ones counting more.

@@ -142,7 +142,7 @@ def test_a_visit_of_one_scan(hits: int) -> None:
 
 
 def jumping(odometry_lies: bool) -> tuple[FloatArray, FloatArray]:
-    """True poses in the known room; the path of a robot whose first ten poses are 0.31 m off, or whose odometry once is."""
+    """True poses in the known room; the path found if its first ten poses are 0.31 m off, or odometry once is."""
     base = room()[2]
     log, points, increments = drive()
     true, increments = log.poses[:40], np.vstack([np.zeros(3), se2.between(log.poses[:39], log.poses[1:40])])

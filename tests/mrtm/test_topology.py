@@ -192,7 +192,7 @@ def test_the_error_of_a_map_is_that_of_the_poses_it_was_made_from() -> None:
     vertex.covariances = np.diag([1e-4, 2e-4, 1e-4])[None]
     found = vertex.uncertain(pose, own)
     assert found.pose.equals(gtsam.Pose2(5.0, 0.0, np.pi / 2), 1e-12)
-    # Five metres on, turned to the left: what was to the side is ahead, and the heading's error moves it by 5 m times that.
+    # Five metres on, turned left: what was to the side is ahead, and moves by 5 m times the error of the heading.
     added = found.covariance - own
     assert added[0, 0] == pytest.approx(2e-4 + 25.0 * 1e-4)
     assert added[1, 1] == pytest.approx(1e-4)
