@@ -38,7 +38,8 @@ STRAIGHT = 0.6  # length of the mean normal of a surfel that is of one wall, not
 WALL = 0.5  # metres to both sides over which a wall's direction is found
 PARALLEL = 0.8  # cosine between normals, and
 FLAT = 0.03  # metres off the line, within which surfels are of one wall
-LEAST_SURFELS = 4  # that make a wall
+LEAST_SURFELS = 4  # that make a wall,
+LEAST_SPREAD = 0.05  # metres, and how far along it they scatter at least
 USUAL = 50.0  # endpoints that scatter as expected, taken for granted
 INFLATION = 1.7  # of the scans' covariance for what is linearised and discretised; from simulated truth
 # What the errors of neighbouring endpoints share is found by looking together at the residuals of
@@ -112,6 +113,8 @@ def _normals(index, surfels, count, resolution, out):  # type: ignore[no-untyped
         if found < LEAST_SURFELS:
             continue
         spread = saa - sa * sa / total
+        if spread < LEAST_SPREAD * LEAST_SPREAD * total:
+            continue
         slope = (sad - sa * sd / total) / spread
         scale = 1.0 / math.sqrt(1.0 + slope * slope)
         out[k, 0] = scale * (nx + slope * ny)
