@@ -114,8 +114,7 @@ class Robot:
         here.maps, here.spread = visit.maps, visit.spread
         here.scans.extend(range(self._first, self._first + len(visit.poses)))
         here.poses.extend(visit.poses)
-        here.places = np.concatenate([here.places, visit.poses[visit.chosen]])
-        here.covariances = np.concatenate([here.covariances, [c.covariance for c in chosen]])
+        here.drawn_from(visit.poses[visit.chosen], np.array([c.covariance for c in chosen]))
         self._tell(
             "left vertex",
             vertex=str(here.id),

@@ -38,6 +38,13 @@ class Vertex:
     scans: list[int] = field(default_factory=list)
     poses: list[FloatArray] = field(default_factory=list)
 
+    def drawn_from(self, poses: FloatArray, covariances: FloatArray) -> None:
+        """Take note of poses (k, 3) with covariances (k, 3, 3) that the map was made from: those where there was none."""
+        off = poses[:, None, :2] - self.places[None, :, :2]
+        new = (np.hypot(off[..., 0], off[..., 1]) > NEAR).all(axis=1)
+        self.places = np.concatenate([self.places, poses[new]])
+        self.covariances = np.concatenate([self.covariances, covariances[new]])
+
     def uncertain(self, pose: FloatArray, covariance: FloatArray) -> UncertainPose:
         """A pose (3,) known to ``covariance`` (3, 3) in the map, with the map's own error as seen from it added.
 

@@ -202,3 +202,8 @@ def test_the_error_of_a_map_is_that_of_the_poses_it_was_made_from() -> None:
     vertex.places = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
     vertex.covariances = np.stack([np.diag([1e-4, 2e-4, 1e-4]), 1e-6 * np.eye(3)])
     assert vertex.uncertain(pose, own).covariance[0, 0] - own[0, 0] < 0.3 * added[0, 0]
+    # A later visit draws into the map that is there, and does not make it worse.
+    before = vertex.places.copy()
+    vertex.drawn_from(np.array([[5.5, 0.5, 1.0], [12.0, 0.0, 0.0]]), np.stack([np.eye(3), 2.0 * np.eye(3)]))
+    np.testing.assert_array_equal(vertex.places, [*before, [12.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(vertex.covariances[-1], 2.0 * np.eye(3))
