@@ -39,7 +39,7 @@ class Vertex:
     poses: list[FloatArray] = field(default_factory=list)
 
     def drawn_from(self, poses: FloatArray, covariances: FloatArray) -> None:
-        """Take note of poses (k, 3) with covariances (k, 3, 3) that the map was made from: those where there was none."""
+        """Take note of poses (k, 3) with covariances (k, 3, 3) that the map was made from, where there was none yet."""
         off = poses[:, None, :2] - self.places[None, :, :2]
         new = (np.hypot(off[..., 0], off[..., 1]) > NEAR).all(axis=1)
         self.places = np.concatenate([self.places, poses[new]])
