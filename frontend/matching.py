@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from frontend.grid import NX, NY, N, X, Y
+from frontend.grid import NX, NY, TILE, N, X, Y, at
 
 MAX_ITERATIONS = 15
 FIRST_GATE = 0.30  # metres: how far from a surfel an endpoint may lie in the first iteration,
@@ -42,7 +42,7 @@ def match(log_odds, index, surfels, resolution, hits, start, prior, information,
         have a surfel; how many lie in free space instead; and the log-likelihood relative to that of a perfect fit.
         Endpoints in unknown space count for nothing.
     """
-    rows, columns = index.shape
+    columns = rows = len(index) * TILE
     inv = 1.0 / resolution
     half_u = 0.5 * columns
     half_v = 0.5 * rows
@@ -99,7 +99,7 @@ def match(log_odds, index, surfels, resolution, hits, start, prior, information,
             v = vs[i]
             if u < 0 or v < 0 or u >= columns or v >= rows:
                 continue
-            k = index[v, u]
+            k = at(index, v, u)
             if k > 0:
                 if k != met[i]:
                     met[i] = k
@@ -142,7 +142,7 @@ def match(log_odds, index, surfels, resolution, hits, start, prior, information,
                         j2[lines] = ny * rx[i] - nx * ry[i]
                         lines += 1
                         continue
-            if final and log_odds[v, u] < FREE:
+            if final and at(log_odds, v, u) < FREE:
                 free += 1
         for i in range(lines):
             m = e[i] * e[i] * weight_line
@@ -236,7 +236,7 @@ def search(log_odds, index, surfels, resolution, hits, centre, reach_xy, step_xy
     Returns:
         number of peaks found.
     """
-    rows, columns = index.shape
+    columns = rows = len(index) * TILE
     inv = 1.0 / resolution
     half_u = 0.5 * columns
     half_v = 0.5 * rows
@@ -266,10 +266,10 @@ def search(log_odds, index, surfels, resolution, hits, centre, reach_xy, step_xy
                     u = int(rx[i] + ox)
                     v = int(ry[i] + oy)
                     if 0 <= u < columns and 0 <= v < rows:
-                        k = index[v, u]
+                        k = at(index, v, u)
                         if k > 0:
                             near += 1
-                        elif log_odds[v, u] < FREE:
+                        elif at(log_odds, v, u) < FREE:
                             free += 1
                 e0 = ix * step_xy
                 e1 = iy * step_xy

@@ -93,10 +93,10 @@ def _propose(log_odds, index, surfels, resolution, hits, priors, variances, inde
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _insert_all(log_odds, index, surfels, counts, bounds, resolution, poses, hits, clear, sensor):  # type: ignore[no-untyped-def]
+def _insert_all(log_odds, index, surfels, counts, touched, resolution, poses, hits, clear, sensor):  # type: ignore[no-untyped-def]
     for p in prange(len(poses)):
         counts[p] = insert(
-            log_odds[p], index[p], surfels[p], counts[p], bounds[p], resolution, poses[p], hits, clear, sensor
+            log_odds[p], index[p], surfels[p], counts[p], touched[p], resolution, poses[p], hits, clear, sensor
         )
 
 
@@ -308,7 +308,7 @@ class ParticleFilter:
         """Add a scan to every particle's map, at ``poses`` (particles, 3)."""
         m = self.maps
         _insert_all(
-            m.log_odds, m.index, m.surfels, m.counts, m.bounds, m.resolution,
+            m.log_odds, m.index, m.surfels, m.counts, m.touched, m.resolution,
             poses, points.hits, points.clear, points.sensor,
         )  # fmt: skip
 

@@ -115,13 +115,8 @@ def _result(robot: Robot, graph: JointGraph, config: Config, events: list[Event]
 def _local_map(vertex: Vertex, times: np.ndarray) -> LocalMap:
     maps = vertex.maps
     assert maps is not None
-    r0, r1, c0, c1 = maps.bounds[0]
-    cells = maps.log_odds.shape[1]
-    grid = Grid(
-        maps.log_odds[0, r0:r1, c0:c1].astype(np.float32) / UNIT,
-        maps.resolution,
-        (np.array([c0, r0]) - 0.5 * cells) * maps.resolution,
-    )
+    log_odds, corner = maps.known(0)
+    grid = Grid(log_odds.astype(np.float32) / UNIT, maps.resolution, corner)
     surfels = maps.surfels[0, 1 : maps.counts[0]].astype(np.float64)
     surfels = surfels[surfels[:, N] > 0]
     normals = surfels[:, NX : NY + 1]

@@ -41,7 +41,7 @@ def look(plan: FloorPlan, poses: FloatArray, laser: LaserModel = LMS200, sensing
 def insert(maps: Maps, points: Points, pose: FloatArray) -> None:
     """Add a scan to map 0 of a stack."""
     maps.counts[0] = grid.insert(
-        *layers(maps)[:3], maps.counts[0], maps.bounds[0], maps.resolution,
+        *layers(maps)[:3], maps.counts[0], maps.touched[0], maps.resolution,
         pose, points.hits, points.clear, points.sensor,
     )  # fmt: skip
 

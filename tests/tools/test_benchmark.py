@@ -337,7 +337,7 @@ def test_beam_evaluations_are_counted() -> None:
     points = points_of(scan, 20.0, 181)
     maps = Maps.empty(1, 60.0, 0.05)
     maps.counts[0] = insert(
-        maps.log_odds[0], maps.index[0], maps.surfels[0], maps.counts[0], maps.bounds[0], maps.resolution,
+        maps.log_odds[0], maps.index[0], maps.surfels[0], maps.counts[0], maps.touched[0], maps.resolution,
         np.zeros(3), points.hits, points.clear, points.sensor,
     )  # fmt: skip
 
