@@ -17,7 +17,6 @@ from factors.noise import (
     compose,
     has_kernel,
     inverse,
-    particle_estimate,
     without_kernel,
 )
 from factors.prior import ROOT_COVARIANCE, prior_factor
@@ -53,7 +52,6 @@ __all__ = [
     "intersect",
     "inverse",
     "loop_factor",
-    "particle_estimate",
     "prior_factor",
     "without_kernel",
 ]

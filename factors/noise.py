@@ -1,4 +1,4 @@
-"""Covariances of poses on SE(2): checks, changes of frame, particle sets, the robust kernel.
+"""Covariances of poses on SE(2): checks, changes of frame, the robust kernel.
 
 Convention (the whole project): a covariance is 3x3, order x, y, theta, in the tangent space at the measured
 pose, in the frame of the child: ``a_T_b_true = a_T_b * Exp(xi)``, ``xi ~ N(0, covariance)``. This is what
@@ -83,37 +83,6 @@ def compose(first: UncertainPose, second: UncertainPose) -> UncertainPose:
     return UncertainPose(first.pose.compose(second.pose), carried + second.covariance)
 
 
-def particle_estimate(particles: FloatArray, weights: FloatArray) -> UncertainPose:
-    """Mean and covariance of a weighted set of poses: the spread of ``Log(mean^-1 * particle)`` (M3).
-
-    The mean is the one on the group (zero mean logarithm), found by iteration from the heaviest particle.
-
-    Args:
-        particles: (N, 3) a_T_b, metres and radians, any branch of the angle.
-        weights: (N,) not negative, sum positive; normalised here.
-
-    Returns:
-        a_T_b and its covariance; that of fewer than four distinct particles is singular: no factor takes it.
-
-    Raises:
-        FactorError: if a particle is not finite or the weights are not usable.
-    """
-    if particles.ndim != 2 or particles.shape[1] != 3 or not np.all(np.isfinite(particles)):
-        raise FactorError(f"particles must be finite with shape (N, 3), got shape {particles.shape}")
-    total = float(np.sum(weights))
-    if weights.shape != particles.shape[:1] or not np.all(weights >= 0.0) or not 0.0 < total < np.inf:
-        raise FactorError(f"weights must be (N,), >= 0, with a positive sum: shape {weights.shape}, sum {total}")
-    shares = weights / total
-    mean = gtsam.Pose2(*particles[int(np.argmax(shares))])
-    for _ in range(50):
-        step = shares @ _logs(mean, particles)
-        mean = mean.compose(gtsam.Pose2.Expmap(step))
-        if float(np.abs(step).max()) < 1e-12:
-            break
-    logs = _logs(mean, particles)
-    return UncertainPose(mean, (shares[:, None] * logs).T @ logs)
-
-
 def robust(model: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
     """``model`` under dynamic covariance scaling (Agarwal et al. 2013), for edges that may be false.
 
@@ -136,15 +105,3 @@ def without_kernel(factor: gtsam.BetweenFactorPose2) -> gtsam.BetweenFactorPose2
         return factor
     tail, head = factor.keys()
     return gtsam.BetweenFactorPose2(tail, head, factor.measured(), noise.noise())
-
-
-def _logs(mean: gtsam.Pose2, poses: FloatArray) -> FloatArray:
-    """(N, 3) Log(mean^-1 * pose), the closed form of gtsam.Pose2.Logmap for many poses at once."""
-    c, s = np.cos(mean.theta()), np.sin(mean.theta())
-    dx, dy = poses[:, 0] - mean.x(), poses[:, 1] - mean.y()
-    x, y = c * dx + s * dy, c * dy - s * dx
-    theta = np.remainder(poses[:, 2] - mean.theta() + np.pi, 2.0 * np.pi) - np.pi
-    half = 0.5 * theta
-    small = np.abs(half) < 1e-5
-    cot = np.where(small, 1.0 - half * half / 3.0, half / np.tan(np.where(small, 1.0, half)))
-    return np.stack([cot * x + half * y, cot * y - half * x, theta], axis=1)
