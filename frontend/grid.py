@@ -36,6 +36,9 @@ FRACTION = 44  # binary digits of a cell in the fixed-point numbers that walk al
 FARTHEST = 1 << 18  # cells from a map's corner to a sensor that those numbers can hold
 
 
+Layers = tuple[npt.NDArray[np.int8], npt.NDArray[np.uint16], npt.NDArray[np.float32], float]
+
+
 @dataclass(frozen=True, slots=True)
 class Maps:
     """A stack of P equal-sized square maps of T x T tiles, the frame's origin in the middle.
@@ -83,6 +86,10 @@ class Maps:
             source.log_odds, source.index, source.surfels, source.counts, source.touched,
             self.log_odds, self.index, self.surfels, self.counts, self.touched, parents, source is self,
         )  # fmt: skip
+
+    def layers(self, p: int) -> Layers:
+        """Map ``p`` as the kernels of ``matching`` take it: log-odds, index, surfels, resolution."""
+        return self.log_odds[p], self.index[p], self.surfels[p], self.resolution
 
     def known(self, p: int) -> tuple[npt.NDArray[np.int8], FloatArray]:
         """The part of map ``p`` that holds anything: log-odds (rows, columns), and (2,) x, y of its outer corner."""
