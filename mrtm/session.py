@@ -7,6 +7,7 @@ import numpy as np
 
 from factors import VertexId
 from frontend import se2
+from frontend.ahead import ahead
 from frontend.grid import NX, NY, UNIT, N, X, Y
 from frontend.local_map import Grid, LocalMap
 from frontend.rbpf import first_run
@@ -40,7 +41,7 @@ def run_log(path: Path, out: Path, config: Config, progress: Progress) -> RunRes
     def report(scans: int, vertices: int) -> None:
         progress(MAPPING * log.report.fraction, f"{scans} scans, {vertices} vertices")
 
-    result = map_scans(log.scans(), config, report, path.name.split(".")[0])
+    result = map_scans(ahead(log.scans()), config, report, path.name.split(".")[0])
     progress(MAPPING, "writing")
     result.blemishes.extend(log.report.blemishes())
     export(result, out)
