@@ -21,6 +21,7 @@ from factors.noise import (
     without_kernel,
 )
 from factors.prior import ROOT_COVARIANCE, prior_factor
+from factors.sighting import Sighting
 
 _FACTORS: dict[EdgeKind, Callable[[Edge, int, int], gtsam.BetweenFactorPose2]] = {
     EdgeKind.INTER_VERTEX: inter_vertex_factor,
@@ -40,6 +41,7 @@ __all__ = [
     "EdgeId",
     "EdgeKind",
     "FactorError",
+    "Sighting",
     "UncertainPose",
     "VertexId",
     "adjoint_transport",
