@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -72,14 +72,24 @@ def evaluate(
     out: Annotated[Path, typer.Argument(help="What `mrtm run` left behind.")],
     relations: Annotated[Path | None, typer.Option(metavar="FILE", help="True relative poses.")] = None,
     truth: Annotated[Path | None, typer.Option(metavar="TUM", help="True or reference trajectory.")] = None,
+    session: Annotated[
+        Path | None, typer.Option(metavar="YAML", help="A team's session: its relations and truth, where not given.")
+    ] = None,
 ) -> None:
     """Measure a run against the truth."""
-    if relations is None and truth is None:
-        raise typer.BadParameter("give --relations FILE, --truth TUM, or both")
+    references: Mapping[str, Path] | Path | None = truth
+    if session is not None:
+        from mrtm.team.session_file import read_session
+
+        team = read_session(session)
+        relations, references = relations or team.relations, truth or team.truth
+    if not (relations or references):
+        given = "give" if session is None else f"{session} names neither relations nor truth; give"
+        raise typer.BadParameter(f"{given} --relations FILE, --truth TUM, or a --session YAML that names them")
     from mrtm.evaluation import evaluate_output
     from mrtm.output.report import evaluation_report
 
-    _print(evaluation_report(evaluate_output(out, relations, truth)))
+    _print(evaluation_report(evaluate_output(out, relations, references)))
 
 
 @app.command()

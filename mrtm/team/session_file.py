@@ -129,7 +129,7 @@ def _no_truth_value(value: Any) -> Any:
 def _file_name(name: Any) -> str:
     if not isinstance(name, str):  # YAML reads 1 as a number and no as false
         raise ValueError("a robot's name must be text; put it in quotes")
-    if not (_fit(name) == name and len(name) <= LONGEST_NAME):
+    if not (0 < len(name) <= LONGEST_NAME and _fit(name) == name):
         raise ValueError(f"a robot's name must do as a file's: at most {LONGEST_NAME} letters, digits or - _ .")
     return name
 
