@@ -3,9 +3,11 @@
 import csv
 import math
 import random
+import unicodedata
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -251,6 +253,30 @@ def test_bytes_and_sizes_that_are_no_sightings(place: Path) -> None:
         file.truncate(100 * LARGEST)  # takes no room on the disk
     with pytest.raises(SessionError, match=r"seen\.csv: larger than 64 MiB"):
         read_sightings(place / "seen.csv", ("red", "blue"))
+
+
+_NAMES = st.text(st.characters(categories=["L", "N", "Zs"], include_characters="-_. "), min_size=1, max_size=64)
+_ROBOTS = st.dictionaries(
+    _NAMES.filter(lambda name: name.isprintable() and name == name.strip(" .")),
+    st.tuples(st.floats(0, 1e9), st.none() | st.floats(1e-3, 1e9), st.floats(0, 1e9)),
+    min_size=1,
+    max_size=6,
+).filter(lambda robots: len({unicodedata.normalize("NFKC", name).casefold() for name in robots}) == len(robots))
+
+
+@given(_ROBOTS)
+@settings(max_examples=50, deadline=None)
+def test_sessions_survive_being_written(
+    tmp_path_factory: pytest.TempPathFactory, robots: dict[str, tuple[float, float | None, float]]
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "written.yaml"
+    members, expected = {}, []
+    for name, (begin, length, start) in robots.items():
+        end = None if length is None else begin + length
+        members[name] = {"log": f"{name}.clf", "from": begin, "start": start} | ({} if end is None else {"to": end})
+        expected.append(Member(name, path.parent / f"{name}.clf", begin, math.inf if end is None else end, start))
+    path.write_text(yaml.safe_dump({"robots": members}, allow_unicode=True, sort_keys=False), encoding="utf-8")
+    assert read_session(path).members == tuple(expected)
 
 
 _ANGLES = st.floats(-2 * math.pi, 2 * math.pi)
