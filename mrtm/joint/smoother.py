@@ -40,23 +40,23 @@ class Smoother:
     def __init__(
         self,
         prior: gtsam.PriorFactorPose2,
-        factors: Mapping[EdgeId, gtsam.BetweenFactorPose2],
+        factors: Mapping[EdgeId, gtsam.NoiseModelFactor],
         values: gtsam.Values,
     ) -> None:
         self._prior = prior
-        self._factors: dict[EdgeId, gtsam.BetweenFactorPose2] = {}
+        self._factors: dict[EdgeId, gtsam.NoiseModelFactor] = {}
         self._values: gtsam.Values | None = None
         self._seen_from: dict[int, gtsam.ISAM2] = {}
         self._start(factors, values)
 
     @property
-    def factors(self) -> Mapping[EdgeId, gtsam.BetweenFactorPose2]:
+    def factors(self) -> Mapping[EdgeId, gtsam.NoiseModelFactor]:
         """The factors that are in."""
         return self._factors
 
     def update(
         self,
-        add: Mapping[EdgeId, gtsam.BetweenFactorPose2],
+        add: Mapping[EdgeId, gtsam.NoiseModelFactor],
         values: gtsam.Values,
         remove: Collection[EdgeId],
     ) -> None:
@@ -119,7 +119,7 @@ class Smoother:
             self._seen_from[reference].update(graph, self.values())
         return _symmetric(self._seen_from[reference].marginalCovariance(key))
 
-    def _start(self, factors: Mapping[EdgeId, gtsam.BetweenFactorPose2], values: gtsam.Values) -> None:
+    def _start(self, factors: Mapping[EdgeId, gtsam.NoiseModelFactor], values: gtsam.Values) -> None:
         self._isam = gtsam.ISAM2(_parameters())
         prior = gtsam.NonlinearFactorGraph()
         prior.push_back(self._prior)
@@ -134,7 +134,7 @@ class Smoother:
 
     def _insert(
         self,
-        add: Mapping[EdgeId, gtsam.BetweenFactorPose2],
+        add: Mapping[EdgeId, gtsam.NoiseModelFactor],
         values: gtsam.Values,
         remove: Collection[EdgeId],
     ) -> None:
