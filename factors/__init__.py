@@ -5,6 +5,7 @@ from typing import Any
 
 import gtsam
 
+from factors.alignment import alignment_factor
 from factors.covariance_intersection import covariance_intersection_factor, intersect
 from factors.edge import Edge, EdgeId, EdgeKind, GraphEdge, VertexId
 from factors.errors import FactorError
@@ -32,6 +33,7 @@ _FACTORS: dict[EdgeKind, Callable[[Any, int, int], gtsam.NoiseModelFactor]] = {
     EdgeKind.LOOP: loop_factor,
     EdgeKind.FUSING: fusing_factor,
     EdgeKind.SIGHTING: sighting_factor,
+    EdgeKind.ALIGNMENT: alignment_factor,
 }
 
 
@@ -59,6 +61,7 @@ __all__ = [
     "UncertainPose",
     "VertexId",
     "adjoint_transport",
+    "alignment_factor",
     "check_covariance",
     "check_pose",
     "compose",

@@ -41,6 +41,7 @@ class EdgeKind(StrEnum):
     LOOP = "loop"  # M8
     FUSING = "fusing"  # M11
     SIGHTING = "sighting"  # Eq. 9
+    ALIGNMENT = "alignment"  # M13
 
 
 class GraphEdge(Protocol):
