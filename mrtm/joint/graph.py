@@ -153,9 +153,9 @@ class JointGraph:
         Squared Mahalanobis distance under the covariance of the edge and of the joint estimate together; both
         ends must be in the graph.
         """
-        expected = self.relative(edge.tail, edge.head)
-        residual, jacobian = edge.residual(expected.pose)
-        covariance = edge.covariance + jacobian @ expected.covariance @ jacobian.T
+        tail, head = self._key(edge.tail), self._key(edge.head)
+        residual, jacobian = edge.residual(self._smoother.pose(tail).between(self._smoother.pose(head)))
+        covariance = edge.covariance + jacobian @ self._smoother.relative_covariance(tail, head) @ jacobian.T
         return float(residual @ np.linalg.solve(covariance, residual))
 
     def chi2(self, edge_id: EdgeId) -> float:
