@@ -56,6 +56,20 @@ class TopologyParameters(Section):
     trial_lead: Annotated[float, Parameter("", "by which one place must beat all others", ge=0, le=1)] = 0.05
 
 
+@dataclass(frozen=True)
+class TeamParameters(Section):
+    """Meetings of robots (M9 to M11)."""
+
+    sighting_xy: Annotated[
+        float,
+        Parameter("m", "standard deviation of what a sighting's own does not count, as bad timing", paper="0", ge=0),
+    ] = 0.2
+    sighting_theta: Annotated[
+        float, Parameter("rad", "the same of its bearing and heading at the robots", paper="0", ge=0)
+    ] = 0.2
+    exchange_interval: Annotated[float, Parameter("s", "between two exchanges while robots see each other", gt=0)] = 5.0
+
+
 class Config(BaseModel):
     """Every parameter of a run.
 
@@ -68,6 +82,7 @@ class Config(BaseModel):
     seed: Annotated[int, Parameter("", "of all random numbers: same seed, same result", ge=0, lt=2**63)] = 0
     frontend: FilterParameters = Field(default_factory=FilterParameters)
     topology: TopologyParameters = Field(default_factory=TopologyParameters)
+    team: TeamParameters = Field(default_factory=TeamParameters)
 
     @model_validator(mode="after")
     def _check(self) -> "Config":

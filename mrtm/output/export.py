@@ -3,6 +3,7 @@
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -107,7 +108,7 @@ def run_record(result: RunResult) -> dict[str, Any]:
             for event in result.events
         ],
         "blemishes": result.blemishes,
-    }
+    } | ({} if result.team is None else {"team": asdict(result.team)})
 
 
 def _vertex_record(result: RunResult, vertex: VertexId, component: int) -> dict[str, Any]:

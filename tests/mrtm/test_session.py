@@ -19,7 +19,7 @@ from frontend.errors import LogError
 from mrtm.config import Config, load_config
 from mrtm.evaluation import evaluate_output, read_tum
 from mrtm.result import RunResult
-from mrtm.session import run_log
+from mrtm.session import run_session
 from tests.mrtm.small_logs import edge_errors, errors, false_edges, mapped, office_ring, poses, ring, room, small
 from tools.simulation import LMS200, LMS200_HALF_DEGREE, LaserModel, SimulatedLog, write_carmen, write_tum
 
@@ -41,7 +41,7 @@ def write(tmp_path: Path) -> Write:
 
 
 def run(path: Path, out: Path, config: Config | None = None) -> RunResult:
-    return run_log(path, out, config or small(), lambda fraction, doing: None)
+    return run_session(path, out, config or small(), lambda fraction, doing: None)
 
 
 def contents(out: Path) -> dict[str, bytes]:
