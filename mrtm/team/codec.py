@@ -5,7 +5,7 @@ Bytes come from others: every field is checked, and nothing is made that the bou
 
 import reprlib
 import struct
-from typing import Any, NoReturn
+from typing import Any
 
 import gtsam
 import msgpack
@@ -14,6 +14,7 @@ import numpy as np
 from factors import Edge, EdgeId, FactorError, UncertainPose, VertexId
 from factors.sighting import Sighting
 from frontend.records import FloatArray
+from mrtm.team.checks import RecordError
 from mrtm.team.map_codec import PackedMap, pack_map, unpack_map
 from mrtm.team.records import (
     TOLD_EDGES,
@@ -22,7 +23,6 @@ from mrtm.team.records import (
     Kind,
     MapRecord,
     Record,
-    RecordError,
     SightingRecord,
     VertexRecord,
 )
@@ -156,31 +156,31 @@ class _Row:
         value = self._take(name)
         if type(value) is int:
             return value
-        self._refuse(name, value, "a whole number")
+        raise self._refused(name, value, "a whole number")
 
     def index(self, name: str, size: int) -> int:
         value = self.count(name)
         if 0 <= value < size:
             return value
-        self._refuse(name, value, f"below {size}")
+        raise self._refused(name, value, f"below {size}")
 
     def real(self, name: str) -> float:
         value = self._take(name)
         if type(value) is float:
             return value
-        self._refuse(name, value, "a number")
+        raise self._refused(name, value, "a number")
 
     def text(self, name: str) -> str:
         value = self._take(name)
         if type(value) is str:
             return value
-        self._refuse(name, value, "text")
+        raise self._refused(name, value, "text")
 
     def data(self, name: str, *sizes: int) -> bytes:
         value = self._take(name)
         if type(value) is bytes and (not sizes or len(value) in sizes):
             return value
-        self._refuse(name, value, f"{' or '.join(map(str, sizes)) or 'some'} bytes")
+        raise self._refused(name, value, f"{' or '.join(map(str, sizes)) or 'some'} bytes")
 
     def vertex(self, name: str, robot: str) -> VertexId:
         match self._take(name):
@@ -189,7 +189,7 @@ class _Row:
             case [str(other), int(index)]:
                 return VertexId(other, index)
             case value:
-                self._refuse(name, value, "an index, or robot and index")
+                raise self._refused(name, value, "an index, or robot and index")
 
     def pose(self, name: str) -> UncertainPose:
         x, y, theta, *upper = _POSE.unpack(self.data(name, _POSE.size))
@@ -208,5 +208,5 @@ class _Row:
         self._next += 1
         return self._fields[self._next - 1]
 
-    def _refuse(self, name: str, value: Any, must: str) -> NoReturn:
-        raise RecordError(f"{self.what}: {name} is {reprlib.repr(value)}; must be {must}")
+    def _refused(self, name: str, value: Any, must: str) -> RecordError:
+        return RecordError(f"{self.what}: {name} is {reprlib.repr(value)}; must be {must}")

@@ -3,8 +3,8 @@
     a -> b  SUMMARY  a hash of all a knows. The same as b's: the meeting is over.
     b -> a  WRITERS  a hash for each robot that b has records of.
     a -> b  KEYS     what a has of the robots whose hashes differ.
-    b -> a  KEYS     likewise, where a has something;  RECORDS  what a lacks.
-    a -> b  RECORDS  what b lacks.
+    b -> a  RECORDS  what a lacks;  WANTS  keys of what b lacks.
+    a -> b  RECORDS  those.
 
 Nobody remembers where a meeting stands: an answer depends on the message and the store alone. So a message may be lost,
 doubled, late or damaged: the meeting tells less, and the next one the rest. Answers only go down the list, so a meeting
@@ -16,8 +16,20 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
-from mrtm.team.messages import CHUNK, MessageError, Stage, open_message, pack_keys, seal, unpack_keys, unpack_writers
-from mrtm.team.records import Key, Kind, RecordError
+from mrtm.team.checks import RecordError
+from mrtm.team.messages import (
+    CHUNK,
+    MessageError,
+    Stage,
+    open_message,
+    pack_keys,
+    pack_wants,
+    seal,
+    unpack_keys,
+    unpack_wants,
+    unpack_writers,
+)
+from mrtm.team.records import Key, Kind
 from mrtm.team.store import Digest, Item, Store, item_of
 
 MOST_KEYS = 4096
@@ -103,12 +115,15 @@ def receive(store: Store, message: bytes) -> Outcome:
             case Stage.WRITERS:
                 theirs, ours = unpack_writers(content), store.writers()
                 differ = sorted(name for name in theirs | ours if theirs.get(name) != ours.get(name))
-                outcome.replies.extend(_keys(store, differ, ask=True))
+                outcome.replies.extend(_keys(store.digest(differ)))
             case Stage.KEYS:
-                ask, digest = unpack_keys(content)
-                if ask:
-                    outcome.replies.extend(_keys(store, [name for name, known in digest.items() if known], ask=False))
+                digest = unpack_keys(content)
                 outcome.replies.extend(_records(store.missing(digest, digest)))
+                wants = store.wants(digest)
+                if wants:
+                    outcome.replies.append(("digest", seal(Stage.WANTS, pack_wants(wants))))
+            case Stage.WANTS:
+                outcome.replies.extend(_records(store.items(unpack_wants(content))))
             case Stage.RECORDS:
                 _learn(store, content, outcome)
     except MessageError as error:
@@ -129,18 +144,18 @@ def _learn(store: Store, content: object, outcome: Outcome) -> None:
             outcome.learned.append(item.key)
 
 
-def _keys(store: Store, writers: list[str], ask: bool) -> Iterator[tuple[str, bytes]]:
-    """What the store has of some writers, those of one in one message."""
+def _keys(digest: Digest) -> Iterator[tuple[str, bytes]]:
+    """Messages of about MOST_KEYS keys, those of one writer in one message."""
     part: Digest = {}
     size = 0
-    for name, known in store.digest(writers).items():
+    for name, known in digest.items():
         if part and size + len(known) > MOST_KEYS:
-            yield "digest", seal(Stage.KEYS, pack_keys(ask, part))
+            yield "digest", seal(Stage.KEYS, pack_keys(part))
             part, size = {}, 0
         part[name] = known
         size += 1 + len(known)
     if part:
-        yield "digest", seal(Stage.KEYS, pack_keys(ask, part))
+        yield "digest", seal(Stage.KEYS, pack_keys(part))
 
 
 def _records(items: Iterable[Item]) -> Iterator[tuple[str, bytes]]:

@@ -19,7 +19,7 @@ import zstandard
 from frontend.local_map import Grid
 from frontend.records import FloatArray
 from mrtm.joint.fusion import FREE_VOTE, OCCUPIED_VOTE
-from mrtm.team.records import MOST_POINTS, RecordError, check_frame
+from mrtm.team.checks import MOST_POINTS, RecordError, check_frame
 
 Cells = npt.NDArray[np.uint8]
 
@@ -165,7 +165,7 @@ def _on_line(steps: npt.NDArray[np.int64], angles: npt.NDArray[np.int64]) -> Flo
     distances = np.clip((steps + 0.5) / STEPS, -_FARTHEST[angles], _FARTHEST[angles])
     normals = _DIRECTIONS[angles]
     foot = distances[:, None] * normals
-    points = foot.clip(-_HALF, _HALF)
+    points: FloatArray = foot.clip(-_HALF, _HALF)
     outside = np.flatnonzero((points != foot).any(axis=1))  # slide along the line to the border
     short = np.abs(normals[outside]).argmin(axis=1)
     rest = distances[outside] - np.einsum("ij,ij->i", points[outside], normals[outside])

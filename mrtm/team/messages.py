@@ -2,6 +2,7 @@
 
 import hashlib
 import reprlib
+from collections.abc import Iterable, Iterator, Sequence
 from enum import IntEnum
 from typing import Any
 
@@ -10,8 +11,9 @@ import numpy as np
 import zstandard
 
 from mrtm.errors import MrtmError
+from mrtm.team.checks import RecordError, check_name
 from mrtm.team.codec import KINDS
-from mrtm.team.records import RecordError, check_name
+from mrtm.team.records import Key, Kind
 from mrtm.team.store import Digest
 
 PROTOCOL = 1
@@ -35,7 +37,8 @@ class Stage(IntEnum):
     SUMMARY = 0
     WRITERS = 1
     KEYS = 2
-    RECORDS = 3
+    WANTS = 3
+    RECORDS = 4
 
 
 def seal(stage: Stage, content: Any) -> bytes:
@@ -82,51 +85,75 @@ def unpack_writers(content: Any) -> dict[str, bytes]:
     return content
 
 
-def pack_keys(ask: bool, digest: Digest) -> list[Any]:
-    """The content of KEYS: whether the other's are wanted, and for each writer four columns of its records."""
+def pack_keys(digest: Digest) -> dict[str, list[bytes]]:
+    """The content of KEYS: for each writer columns of its records: kinds, numbers, versions, beginnings of hashes."""
     columns = {}
     for writer, known in digest.items():
         rows = sorted((KINDS.index(kind), number, *stamp) for (kind, number), stamp in known.items())
-        numbers = np.array([row[1] for row in rows], np.uint32)
-        columns[writer] = [
-            bytes(row[0] for row in rows),
-            np.diff(numbers, prepend=np.uint32(0)).astype("<u4").tobytes(),  # mostly 1, modulo 2^32
-            np.array([row[2] for row in rows], "<u4").tobytes(),
-            b"".join(row[3][:_SHORT] for row in rows),
-        ]
-    return [ask, columns]
+        versions = np.array([row[2] for row in rows], "<u4").tobytes()
+        columns[writer] = [*_pack_places(rows), versions, b"".join(row[3][:_SHORT] for row in rows)]
+    return columns
 
 
-def unpack_keys(content: Any) -> tuple[bool, Digest]:
+def unpack_keys(content: Any) -> Digest:
     """What ``pack_keys`` packed; the stamps hold the beginnings of hashes.
 
     Raises:
         MessageError: it is of another shape.
     """
-    match content:
-        case [bool(ask), dict(columns)]:
-            return ask, {_check_writer(writer): _known(writer, column) for writer, column in columns.items()}
-    raise MessageError(f"message of keys: {reprlib.repr(content)}; must be whether to answer, and writers")
+    digest: Digest = {}
+    for writer, (kinds, numbers, versions, hashes) in _columns(content, 4):
+        places = _unpack_places(writer, kinds, numbers)
+        if len(versions) != 4 * len(places) or len(hashes) != _SHORT * len(places):
+            raise MessageError(f"message of keys: those of {writer} are not columns of one length")
+        beginnings = (hashes[i : i + _SHORT] for i in range(0, len(hashes), _SHORT))
+        stamps = zip(np.frombuffer(versions, "<u4").tolist(), beginnings, strict=True)
+        digest[writer] = dict(zip(places, stamps, strict=True))
+    return digest
 
 
-def _known(writer: str, columns: Any) -> dict[Any, Any]:
-    match columns:
-        case [bytes(kinds), bytes(numbers), bytes(versions), bytes(hashes)]:
-            n = len(kinds)
-            lengths = (len(numbers), len(versions), len(hashes))
-            if lengths == (4 * n, 4 * n, _SHORT * n) and max(kinds, default=0) < len(KINDS):
-                return {
-                    (KINDS[kind], number): (version, hashes[_SHORT * i : _SHORT * (i + 1)])
-                    for i, (kind, number, version) in enumerate(
-                        zip(
-                            kinds,
-                            np.cumsum(np.frombuffer(numbers, "<u4"), dtype=np.uint32).tolist(),
-                            np.frombuffer(versions, "<u4").tolist(),
-                            strict=True,
-                        )
-                    )
-                }
-    raise MessageError(f"message of keys: those of {writer} are not four columns of one length")
+def pack_wants(keys: Iterable[Key]) -> dict[str, list[bytes]]:
+    """The content of WANTS: for each writer columns of records: kinds, numbers."""
+    rows: dict[str, list[tuple[int, int]]] = {}
+    for key in keys:
+        rows.setdefault(key.robot, []).append((KINDS.index(key.kind), key.number))
+    return {writer: _pack_places(sorted(places)) for writer, places in rows.items()}
+
+
+def unpack_wants(content: Any) -> list[Key]:
+    """What ``pack_wants`` packed.
+
+    Raises:
+        MessageError: it is of another shape.
+    """
+    return [
+        Key(kind, writer, number)
+        for writer, columns in _columns(content, 2)
+        for kind, number in _unpack_places(writer, *columns)
+    ]
+
+
+def _columns(content: Any, count: int) -> Iterator[tuple[str, list[bytes]]]:
+    if not isinstance(content, dict):
+        raise MessageError(f"message of keys: {reprlib.repr(content)}; must be columns for each writer")
+    for writer, columns in content.items():
+        _check_writer(writer)
+        if not isinstance(columns, list) or [type(column) for column in columns] != [bytes] * count:
+            raise MessageError(f"message of keys: those of {writer} are not {count} columns of bytes")
+        yield writer, columns
+
+
+def _pack_places(rows: Sequence[tuple[Any, ...]]) -> list[bytes]:
+    """Two columns of rows that begin with kind and number, ascending; numbers less the one before, mostly 1."""
+    numbers = np.array([row[1] for row in rows], np.uint32)
+    return [bytes(row[0] for row in rows), np.diff(numbers, prepend=np.uint32(0)).astype("<u4").tobytes()]
+
+
+def _unpack_places(writer: str, kinds: bytes, numbers: bytes) -> list[tuple[Kind, int]]:
+    if len(numbers) != 4 * len(kinds) or max(kinds, default=0) >= len(KINDS):
+        raise MessageError(f"message of keys: those of {writer} are not columns of one length, of known kinds")
+    running = np.cumsum(np.frombuffer(numbers, "<u4"), dtype=np.uint32).tolist()
+    return [(KINDS[kind], number) for kind, number in zip(kinds, running, strict=True)]
 
 
 def _check_writer(name: Any) -> str:

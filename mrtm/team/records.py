@@ -8,37 +8,32 @@ import math
 import reprlib
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
-import gtsam
 import numpy as np
-import numpy.typing as npt
 
-from factors import Edge, EdgeKind, FactorError, UncertainPose, VertexId, check_covariance, check_pose
+from factors import Edge, EdgeKind, FactorError, UncertainPose, VertexId, check_covariance
 from factors.sighting import Sighting
 from frontend.local_map import Grid
 from frontend.records import FloatArray
-from mrtm.errors import MrtmError
+from mrtm.team.checks import (
+    FARTHEST,
+    LATEST,
+    MOST_POINTS,
+    RecordError,
+    check,
+    check_array,
+    check_frame,
+    check_name,
+    check_position,
+    check_real,
+    check_vertex,
+    check_whole,
+)
 
-LONGEST_NAME = 64
-LARGEST_NUMBER = 2**31 - 1
-FARTHEST = 1e6
-"""Metres; no coordinate of a building lies beyond."""
-LATEST = 1e12
-"""Seconds, either way."""
-LARGEST_GRID = 4000
-"""Cells along one side."""
-MOST_POINTS = 2**20
-"""Occupied cells of a grid, points of a cloud."""
-FINEST, COARSEST = 0.001, 10.0
-"""Metres a cell."""
 TOLD_EDGES = (EdgeKind.INTER_VERTEX, EdgeKind.COVARIANCE_INTERSECTION, EdgeKind.LOOP)
 """What a robot's own front end finds; packed by their place here. Edges between robots are not told: whoever has the
 sightings derives them."""
-
-
-class RecordError(MrtmError):
-    """A record that does not check: which, which field, the value, and what it must be."""
 
 
 class Kind(StrEnum):
@@ -78,7 +73,7 @@ class VertexRecord:
 
     def __post_init__(self) -> None:
         _check_header(self)
-        _check_count(self.scans, _what(self), "scans")
+        check_whole(self.scans, _what(self), "scans")
 
     @property
     def key(self) -> Key:
@@ -97,10 +92,10 @@ class EdgeRecord:
     def __post_init__(self) -> None:
         _check_header(self)
         what = _what(self)
-        _check(self.edge.kind in TOLD_EDGES, what, "kind", self.edge.kind, f"one of {', '.join(TOLD_EDGES)}")
-        _check_vertex(self.edge.tail, what, "tail")
-        _check_vertex(self.edge.head, what, "head")
-        _check_pose(self.edge.measurement, what, "measurement")
+        check(self.edge.kind in TOLD_EDGES, what, "kind", self.edge.kind, f"one of {', '.join(TOLD_EDGES)}")
+        check_vertex(self.edge.tail, what, "tail")
+        check_vertex(self.edge.head, what, "head")
+        check_position(self.edge.measurement, what, "measurement")
 
     @property
     def key(self) -> Key:
@@ -136,15 +131,15 @@ class MapRecord:
         _check_header(self)
         what, grid = _what(self), self.grid
         check_frame(what, grid.log_odds.shape, grid.resolution, grid.origin)
-        _check_array(grid.log_odds, grid.log_odds.shape, np.float32, what, "log_odds")
+        check_array(grid.log_odds, grid.log_odds.shape, np.float32, what, "log_odds")
         shape = (len(self.cloud), 2)
-        _check(len(self.cloud) <= MOST_POINTS, what, "number of points", len(self.cloud), f"at most {MOST_POINTS}")
-        _check_array(self.cloud, shape, np.float64, what, "cloud")
-        _check_array(self.normals, shape, np.float64, what, "normals")
+        check(len(self.cloud) <= MOST_POINTS, what, "number of points", len(self.cloud), f"at most {MOST_POINTS}")
+        check_array(self.cloud, shape, np.float64, what, "cloud")
+        check_array(self.normals, shape, np.float64, what, "normals")
         squared = (self.normals**2).sum(axis=1)
         odd = squared[(np.abs(squared - 1.0) > 1e-4) & (squared != 0.0)]
         if len(odd):
-            _check(False, what, "length of a normal", math.sqrt(odd[0]), "1, or 0 if unknown")
+            check(False, what, "length of a normal", math.sqrt(odd[0]), "1, or 0 if unknown")
 
     @property
     def key(self) -> Key:
@@ -173,9 +168,9 @@ class AnchorRecord:
     def __post_init__(self) -> None:
         _check_header(self)
         what = _what(self)
-        _check_vertex(self.vertex, what, "vertex")
+        check_vertex(self.vertex, what, "vertex")
         pose, covariance = self.pose
-        _check_pose(pose, what, "pose")
+        check_position(pose, what, "pose")
         try:
             object.__setattr__(self, "pose", UncertainPose(pose, check_covariance(covariance, what)))
         except FactorError as error:
@@ -210,12 +205,12 @@ class SightingRecord:
         _check_header(self)
         what = _what(self)
         check_name(self.observed, what, "observed")
-        _check(self.observed != self.observer, what, "observed", self.observed, "another robot than the observer")
+        check(self.observed != self.observer, what, "observed", self.observed, "another robot than the observer")
         for field, robot in (("observer", self.observer), ("observed", self.observed)):
             owner, number = getattr(self, f"{field}_anchor")
-            _check(owner == robot, what, f"{field}_anchor", owner, f"one of {robot}")
-            _check_count(number, what, f"{field}_anchor")
-        _check(self.measurement.range <= FARTHEST, what, "range", self.measurement.range, f"at most {FARTHEST:g} m")
+            check(owner == robot, what, f"{field}_anchor", owner, f"one of {robot}")
+            check_whole(number, what, f"{field}_anchor")
+        check(self.measurement.range <= FARTHEST, what, "range", self.measurement.range, f"at most {FARTHEST:g} m")
 
     @property
     def key(self) -> Key:
@@ -226,70 +221,13 @@ class SightingRecord:
 Record = VertexRecord | EdgeRecord | MapRecord | AnchorRecord | SightingRecord
 
 
-def check_name(name: Any, what: str, field: str) -> None:
-    """Refuse a robot's name that is not fit for a file name on every system."""
-    fit = (
-        isinstance(name, str)
-        and 0 < len(name) <= LONGEST_NAME
-        and name.isprintable()
-        and not set(name) & set('/\\:*?"<>|')
-        and name == name.strip(" .")
-    )
-    _check(fit, what, field, name, f"a name of at most {LONGEST_NAME} letters, digits or - _ .")
-
-
-def check_frame(what: str, shape: tuple[int, ...], resolution: float, origin: npt.ArrayLike) -> None:
-    """Refuse a grid whose shape, resolution (metres) or origin (metres) is out of bounds."""
-    sides = f"two sides of 1 to {LARGEST_GRID} cells"
-    _check(len(shape) == 2 and all(1 <= side <= LARGEST_GRID for side in shape), what, "shape", shape, sides)
-    _check(FINEST <= resolution <= COARSEST, what, "resolution", resolution, f"{FINEST:g} to {COARSEST:g} m")
-    _check_array(np.asarray(origin), (2,), np.float64, what, "origin")
+def _check_header(record: Record) -> None:
+    what = _what(record)
+    check_name(record.key.robot, what, "robot")
+    check_whole(record.key.number, what, "number")
+    check_whole(record.version, what, "version")
+    check_real(record.time, LATEST, what, "time")
 
 
 def _what(record: Record) -> str:
     return f"{record.key} version {reprlib.repr(record.version)}"
-
-
-def _check(good: bool, what: str, field: str, value: Any, must: str) -> None:
-    if not good:
-        text = value if isinstance(value, str) and value.isprintable() and len(value) < 100 else reprlib.repr(value)
-        raise RecordError(f"{what}: {field} is {text}; must be {must}")
-
-
-def _check_header(record: Record) -> None:
-    what = _what(record)
-    check_name(record.key.robot, what, "robot")
-    _check_count(record.key.number, what, "number")
-    _check_count(record.version, what, "version")
-    _check_real(record.time, LATEST, what, "time")
-
-
-def _check_count(value: Any, what: str, field: str) -> None:
-    good = type(value) is int and 0 <= value <= LARGEST_NUMBER
-    _check(good, what, field, value, f"a whole number from 0 to {LARGEST_NUMBER}")
-
-
-def _check_real(value: Any, limit: float, what: str, field: str) -> None:
-    good = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= limit  # false for NaN
-    _check(good, what, field, value, f"a number within plus and minus {limit:g}")
-
-
-def _check_vertex(vertex: VertexId, what: str, field: str) -> None:
-    check_name(vertex.robot, what, field)
-    _check_count(vertex.index, what, field)
-
-
-def _check_pose(pose: gtsam.Pose2, what: str, field: str) -> None:
-    try:
-        check_pose(pose, what)
-    except FactorError as error:
-        raise RecordError(str(error)) from error
-    _check(max(abs(pose.x()), abs(pose.y())) <= FARTHEST, what, field, (pose.x(), pose.y()), f"within {FARTHEST:g} m")
-
-
-def _check_array(array: npt.NDArray[Any], shape: tuple[int, ...], dtype: Any, what: str, field: str) -> None:
-    good = array.shape == shape and array.dtype == dtype
-    _check(good, what, field, f"{array.dtype} {array.shape}", f"{np.dtype(dtype)} {shape}")
-    # A sum is finite if and only if all are, overflow aside, and needs no second array.
-    bad = not np.isfinite(array.sum()) or (array.size > 0 and max(-array.min(), array.max()) > FARTHEST)
-    _check(not bad, what, field, "not finite or too large", f"numbers within plus and minus {FARTHEST:g}")

@@ -117,7 +117,16 @@ class Store:
 
     def __getitem__(self, key: Key) -> Record:
         """The record of a key, unpacked; KeyError if it is not known."""
-        return self._items[key.robot][key.kind, key.number].record
+        return self.item(key).record
+
+    def item(self, key: Key) -> Item:
+        """The packed record of a key; KeyError if it is not known."""
+        return self._items[key.robot][key.kind, key.number]
+
+    def keys(self, kind: Kind) -> Iterator[Key]:
+        """The keys of one kind, by robot and number."""
+        for robot in sorted(self._items):
+            yield from (Key(kind, robot, number) for found, number in sorted(self._items[robot]) if found == kind)
 
     def of(self, kind: type[R]) -> Iterator[R]:
         """The records of one type, by robot and number; maps are unpacked one after the other."""
@@ -154,15 +163,35 @@ class Store:
 
     def missing(self, digest: Digest, writers: Collection[str] | None = None) -> list[Item]:
         """What somebody lacks that knows ``digest``: of all writers, or of some; topology first, maps last."""
-        items = [
+        return _sorted(
             item
             for robot in (self._items if writers is None else writers)
             for place, item in self._items.get(robot, {}).items()
-            if item.stamp > (theirs := digest.get(robot, {}).get(place, (-1, b""))) and not _same(item.stamp, theirs)
+            if _newer(item.stamp, digest.get(robot, {}).get(place))
+        )
+
+    def wants(self, digest: Digest) -> list[Key]:
+        """The keys of what somebody that knows ``digest`` could tell."""
+        return [
+            Key(kind, robot, number)
+            for robot, known in digest.items()
+            for (kind, number), stamp in known.items()
+            if _newer(stamp, item.stamp if (item := self._items.get(robot, {}).get((kind, number))) else None)
         ]
-        return sorted(items, key=lambda item: (KINDS.index(item.key.kind), item.key.robot, item.key.number))
+
+    def items(self, keys: Iterable[Key]) -> list[Item]:
+        """The items of those keys that are known; topology first, maps last."""
+        found = (self._items.get(key.robot, {}).get((key.kind, key.number)) for key in keys)
+        return _sorted(item for item in found if item is not None)
 
 
-def _same(full: Stamp, short: Stamp) -> bool:
-    """Whether ``short``, whose hash may be only the beginning, is the stamp ``full``."""
-    return full[0] == short[0] and full[1].startswith(short[1])
+def _newer(one: Stamp, other: Stamp | None) -> bool:
+    """Whether ``one`` replaces ``other``; of hashes only as much is compared as both tell."""
+    if other is None:
+        return True
+    length = min(len(one[1]), len(other[1]))
+    return (one[0], one[1][:length]) > (other[0], other[1][:length])
+
+
+def _sorted(items: Iterable[Item]) -> list[Item]:
+    return sorted(items, key=lambda item: (KINDS.index(item.key.kind), item.key.robot, item.key.number))

@@ -4,12 +4,12 @@ from functools import cache
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 
 from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
 from factors.sighting import Sighting
 from frontend.grid import NX, NY, UNIT, N, X, Y
 from frontend.local_map import Grid
-from frontend.records import FloatArray
 from mrtm.team.records import (
     AnchorRecord,
     EdgeRecord,
@@ -41,8 +41,8 @@ def record_of(kind: Kind, robot: str = "red", number: int = 3, version: int = 0,
             return AnchorRecord(robot, number, version, time, VertexId(robot, 4), UncertainPose(pose, COVARIANCE))
         case Kind.SIGHTING:
             seen = Sighting(3.0 + value, 0.2, None if number % 2 else -2.5, 0.1, 0.02, None if number % 2 else 0.05)
-            ends = (robot, number), ("grey", number + 1)
-            return SightingRecord(robot, number, version, time, "grey", seen, *ends)
+            anchors = (robot, number), ("grey", number + 1)
+            return SightingRecord(robot, number, version, time, "grey", seen, *anchors)
         case Kind.MAP:
             log_odds = np.zeros((3, 5), np.float32)
             log_odds[1, 1:3], log_odds[1, 3] = -2.0, 4.0
@@ -50,7 +50,7 @@ def record_of(kind: Kind, robot: str = "red", number: int = 3, version: int = 0,
             return MapRecord(VertexId(robot, number), version, time, grid_of(log_odds), points, normals)
 
 
-def grid_of(log_odds: FloatArray, origin: tuple[float, float] = (1.0, 2.0)) -> Grid:
+def grid_of(log_odds: npt.ArrayLike, origin: tuple[float, float] = (1.0, 2.0)) -> Grid:
     """A grid of 5 cm cells."""
     return Grid(np.asarray(log_odds, np.float32), 0.05, np.array(origin))
 

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from factors import VertexId
 from mrtm.team import codec
+from mrtm.team.checks import RecordError
 from mrtm.team.codec import pack, unpack
-from mrtm.team.records import AnchorRecord, EdgeRecord, Kind, RecordError, SightingRecord, VertexRecord
+from mrtm.team.records import AnchorRecord, EdgeRecord, Kind, SightingRecord, VertexRecord
 from tests.mrtm.record_examples import record_of, room_map
 
 SMALL = [Kind.VERTEX, Kind.EDGE, Kind.ANCHOR, Kind.SIGHTING]

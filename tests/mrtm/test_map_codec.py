@@ -17,8 +17,8 @@ from frontend.local_map import Grid, LocalMap
 from frontend.records import FloatArray
 from mrtm.joint.fusion import fuse
 from mrtm.team import map_codec
+from mrtm.team.checks import RecordError
 from mrtm.team.map_codec import ANGLES, STEPS, VALUES, PackedMap, pack_map, unpack_map
-from mrtm.team.records import RecordError
 from tests.mrtm.record_examples import grid_of, room_map
 
 NOTHING = np.zeros((0, 2))
@@ -119,9 +119,10 @@ def test_an_alignment_to_the_travelled_cloud_finds_the_same_place() -> None:
     for _ in range(30):
         c, s = np.cos(pose[2]), np.sin(pose[2])
         turned = source @ np.array([[c, s], [-s, c]])
-        distance, nearest = tree.query(turned + pose[:2], distance_upper_bound=0.15)
+        distance, nearest = np.array(tree.query(turned + pose[:2], distance_upper_bound=0.15))
         near = np.isfinite(distance)
-        n, q, p = normals[surface][nearest[near]], cloud[surface][nearest[near]], turned[near]
+        partner = nearest[near].astype(int)
+        n, q, p = normals[surface][partner], cloud[surface][partner], turned[near]
         residual = np.einsum("ij,ij->i", n, p + pose[:2] - q)
         jacobian = np.column_stack([n, n[:, 1] * p[:, 0] - n[:, 0] * p[:, 1]])
         weight = 1.0 / (1.0 + (residual / 0.02) ** 2)
@@ -162,7 +163,8 @@ def streamed(data: bytes) -> bytes:
 
 
 def columns(name: str, data: bytes) -> PackedMap:
-    return packed_room()._replace(**{name: data})
+    changed: dict[str, Any] = {name: data}
+    return packed_room()._replace(**changed)
 
 
 def unzipped(name: str) -> bytes:

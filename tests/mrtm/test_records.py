@@ -15,16 +15,15 @@ from factors import EdgeKind, UncertainPose, VertexId
 from factors.sighting import Sighting
 from frontend.local_map import Grid
 from mrtm.team import records, session_file
+from mrtm.team.checks import RecordError, check_name
 from mrtm.team.records import (
     AnchorRecord,
     EdgeRecord,
     Key,
     Kind,
     MapRecord,
-    RecordError,
     SightingRecord,
     VertexRecord,
-    check_name,
 )
 from tests.mrtm.record_examples import COVARIANCE, record_of
 
