@@ -1,6 +1,7 @@
 """A run: a session in, joint map out."""
 
 import os
+import time
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -27,6 +28,7 @@ def run_session(path: Path, out: Path, config: Config, progress: Progress, cores
         SessionError: the session is not one, or a robot's window of its log holds no scan.
         LogError: a log cannot be read or holds no usable scan.
     """
+    started = time.perf_counter()
     session = open_session(path)
     runs = map_members(
         session, config, cores or os.cpu_count() or 1, lambda fraction, doing: progress(MAPPING * fraction, doing)
@@ -38,6 +40,7 @@ def run_session(path: Path, out: Path, config: Config, progress: Progress, cores
         lambda fraction: progress(MAPPING + (PLAYING - MAPPING) * fraction, "meetings and joint map"),
     )
     progress(PLAYING, "writing")
+    result.timings["total"] = time.perf_counter() - started
     export(result, out)
     progress(1.0, f"{result.counts['scans']} scans, {result.counts['vertices']} vertices")
     return result

@@ -80,7 +80,7 @@ _MOST_POINTS = 1500  # of a map that are looked up
 _AREA_STEP = 4  # cells between those that measure the overlap
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class Lookup:
     """A local map made ready for many comparisons.
 

@@ -61,6 +61,8 @@ def export(result: RunResult, out: Path) -> None:
     for path in (*stale, out / "evaluation.json"):
         path.unlink(missing_ok=True)
     result.timings["output"] = time.perf_counter() - started
+    if "total" in result.timings:
+        result.timings["total"] += result.timings["output"]
     with replacing(out / "run.json") as temporary:
         temporary.write_text(to_json(run_record(result)))
 

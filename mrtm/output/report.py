@@ -88,8 +88,9 @@ def _timings(result: RunResult) -> Table:
     table = Table("stage")
     table.add_column("s", justify="right")
     table.add_column("%", justify="right")
-    total = _total(result)
-    for stage, seconds in result.timings.items():
+    stages = {stage: seconds for stage, seconds in result.timings.items() if stage != "total"}
+    total = sum(stages.values())  # of all processes together
+    for stage, seconds in stages.items():
         table.add_row(escape(stage), f"{seconds:.2f}", f"{100 * seconds / total:.0f}" if total > 0 else "")
     return table
 

@@ -17,7 +17,7 @@ class Lookups(Mapping[VertexId, Lookup]):
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._kept: list[Lookup] = []
+        self._kept: dict[VertexId, Lookup] = {}  # else what nobody holds is forgotten
 
     def __getitem__(self, vertex: VertexId) -> Lookup:
         item = self._store.item(Key(Kind.MAP, vertex.robot, vertex.index))
@@ -26,7 +26,7 @@ class Lookups(Mapping[VertexId, Lookup]):
             record = item.record
             assert isinstance(record, MapRecord)
             found = _shared[item.hash] = Lookup.of(record)
-        self._kept.append(found)
+        self._kept[vertex] = found
         return found
 
     def __iter__(self) -> Iterator[VertexId]:

@@ -51,6 +51,7 @@ class Teammate:
         self.joint = JointMap(name)
         self.judgements: Mapping[HypothesisId, Judgement] = {}
         self._parameters = parameters
+        self._maps = Lookups(self.store)
         self._fusing: dict[EdgeId, Between] = {}
         self._told: dict[Key, int] = {}  # version of each record that the joint map knows
 
@@ -77,7 +78,7 @@ class Teammate:
         """M11: judge all sightings anew, and let the accepted ones be the fusing edges."""
         hypotheses = {h.id: h for h in self._hypotheses()}
         graphs = self.joint.robots
-        evidence = MapEvidence(Lookups(self.store), graphs)
+        evidence = MapEvidence(self._maps, graphs)
         found = judge(hypotheses.values(), graphs, evidence)
         self.judgements = found.judgements
         believed: dict[tuple[VertexId, VertexId], list[AnchoredSighting]] = {}
