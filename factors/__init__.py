@@ -13,6 +13,7 @@ from factors.fusing import fuse_sightings, fusing_edge, fusing_factor
 from factors.inter_vertex import inter_vertex_factor
 from factors.loop import loop_factor
 from factors.noise import (
+    FULL_WEIGHT,
     UncertainPose,
     adjoint_transport,
     check_covariance,
@@ -49,6 +50,7 @@ def edge_from_dict(data: dict[str, Any]) -> GraphEdge:
 
 
 __all__ = [
+    "FULL_WEIGHT",
     "ROOT_COVARIANCE",
     "AnchoredSighting",
     "Edge",

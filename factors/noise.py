@@ -19,8 +19,8 @@ FloatArray = npt.NDArray[np.float64]
 # Standard deviations outside 0.1 um .. 100 km, or a condition beyond what doubles can solve, are mistakes.
 _MIN_VARIANCE, _MAX_VARIANCE, _MAX_CONDITION = 1e-14, 1e10, 1e14
 
-# chi2 of so many degrees of freedom, 95 %: up to here an honest edge keeps its full weight.
-_DCS_THRESHOLD = {2: 5.991, 3: 7.815}
+# chi2 of so many degrees of freedom, 95 %: up to here an edge under the robust kernel keeps its full weight.
+FULL_WEIGHT = {2: 5.991, 3: 7.815}
 
 
 class UncertainPose(NamedTuple):
@@ -138,7 +138,7 @@ def robust(model: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
     (Cauchy and Geman-McClure always shave weight); beyond, its pull falls with the third power of the
     residual, so a false edge does not bend a map (Cauchy: the first power, metres of bend on a loose chain).
     """
-    kernel = gtsam.noiseModel.mEstimator.DCS.Create(_DCS_THRESHOLD[model.dim()])
+    kernel = gtsam.noiseModel.mEstimator.DCS.Create(FULL_WEIGHT[model.dim()])
     return gtsam.noiseModel.Robust.Create(kernel, model)
 
 

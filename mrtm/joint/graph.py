@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from factors import (
+    FULL_WEIGHT,
     EdgeId,
     GraphEdge,
     UncertainPose,
@@ -85,10 +86,10 @@ class JointGraph:
         Removals come first. An added edge with one unknown end makes that vertex, placed by the edge; a chain of
         them may come in any order.
 
-        A robust edge between vertices that are held without it gets its full weight first if the present
-        uncertainty explains it (``innovation``, 99.9 %), and comes under its kernel at that optimum: else the
-        kernel, which does not know of the drift, would take most true loops for false ones. Any other comes
-        under its kernel at once, and is without effect until the estimate comes near it.
+        A robust edge that its kernel would weaken, between vertices that are held without it, gets its full weight
+        first if the present uncertainty explains it (``innovation``, 99.9 %), and comes under its kernel at that
+        optimum: else the kernel, which does not know of the drift, would take most true loops for false ones. Any
+        other comes under its kernel at once, and if that weakens it is without effect until the estimate comes near.
 
         Args:
             add: edges with new ids.
@@ -167,8 +168,7 @@ class JointGraph:
         if edge_id not in self._edges:
             raise GraphError(f"edge {edge_id} is not in the joint graph")
         edge = self._edges[edge_id]
-        residual, _ = edge.residual(self.estimate(edge.tail).between(self.estimate(edge.head)))
-        return float(residual @ np.linalg.solve(edge.covariance, residual))
+        return _chi2(edge, self.estimate(edge.tail), self.estimate(edge.head))
 
     def checkpoint(self) -> dict[str, Any]:
         """All that ``restore`` needs, as plain numbers and strings fit for JSON."""
@@ -285,15 +285,17 @@ class JointGraph:
 
         Args:
             settled: factors that come as they are.
-            judged: edges whose weight at the start ``innovation`` decides, if they are robust and hold nothing.
+            judged: edges whose weight at the start ``innovation`` decides, if the kernel would weaken them.
             made: joint_T_vertex of the vertices that are new.
             out: the edges whose factors go.
         """
         first = {edge.id: self._factor(edge) for edge in judged}
         late: dict[EdgeId, gtsam.NoiseModelFactor] = {}
-        for edge_id in reversed(list(first)):  # of several that hold a vertex the first stays, which placed it
-            if has_kernel(first[edge_id]) and not self._cut_off({*late, edge_id}):
-                late[edge_id] = first.pop(edge_id)
+        for edge in reversed(judged):  # of several that hold a vertex the first stays, which placed it
+            tail, head = (made.get(v) or self.estimate(v) for v in (edge.tail, edge.head))
+            strained = has_kernel(first[edge.id]) and _chi2(edge, tail, head) > FULL_WEIGHT[len(edge.covariance)]
+            if strained and not self._cut_off({*late, edge.id}):
+                late[edge.id] = first.pop(edge.id)
         values = gtsam.Values()
         for vertex, pose in made.items():
             values.insert(self._keys[vertex], pose)
@@ -380,6 +382,12 @@ class JointGraph:
 def _joins(edge: GraphEdge, some: Collection[VertexId], others: Collection[VertexId]) -> bool:
     """Whether one end is among ``some`` and the other among ``others``."""
     return (edge.tail in some and edge.head in others) or (edge.head in some and edge.tail in others)
+
+
+def _chi2(edge: GraphEdge, tail: gtsam.Pose2, head: gtsam.Pose2) -> float:
+    """Squared residual over the edge's covariance, its ends at joint_T_tail and joint_T_head."""
+    residual, _ = edge.residual(tail.between(head))
+    return float(residual @ np.linalg.solve(edge.covariance, residual))
 
 
 def _coordinates(pose: gtsam.Pose2) -> list[float]:
