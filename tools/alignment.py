@@ -4,6 +4,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -45,7 +46,7 @@ def main(
     ]
     console = Console(width=None if sys.stdout.isatty() else 160)
     console.print(_recall(cases, names))
-    console.print(_false(cases))
+    console.print(_false(cases, names))
     out.mkdir(parents=True, exist_ok=True)
     title = f"Alignments of true pairs: {seeds} seeds from {first_seed}, guesses {sigma_xy} m, {sigma_theta} rad"
     draw(cases, title, out / "alignment.png")
@@ -76,12 +77,12 @@ def _recall(cases: "Sequence[Case]", names: Sequence[str]) -> Table:
     return table
 
 
-def _false(cases: "Sequence[Case]") -> Table:
-    table = Table("wrong guesses", "cases", "accepted", "of them false", "refused")
-    for kind in ("displaced", "elsewhere"):
-        mine = [case for case in cases if case.kind == kind]
+def _false(cases: "Sequence[Case]", names: Sequence[str]) -> Table:
+    table = Table("wrong guesses", "plan", "cases", "accepted", "of them false", "refused")
+    for kind, name in product(("displaced", "elsewhere"), [*names, "all"]):
+        mine = [case for case in cases if case.kind == kind and name in (case.plan, "all")]
         accepted, false = sum(case.accepted for case in mine), sum(case.is_false for case in mine)
-        table.add_row(kind, str(len(mine)), str(accepted), str(false), _reasons(mine))
+        table.add_row(kind, name, str(len(mine)), str(accepted), str(false), _reasons(mine))
     return table
 
 

@@ -20,7 +20,8 @@ LEAST_PAIRS = 150  # points of one surface: 7.5 m of wall
 MOST_RESIDUAL = 0.03  # metres, rms: points of a cell's width that do not fit are not noise
 LEAST_HITS = 0.7  # of the surface points in space known to the other map that must lie on its surfaces
 MOST_CONFLICTS = 0.08  # of them that may lie in space it says is free: doors and people move
-MOST_RIVAL = 0.85  # of the best place's support that another may have; long walls fit at many places
+MOST_RIVAL = 0.9  # of the best place's score that another may have; long walls fit fairly well at many places
+RIVAL_POINTS = 0.3  # of the best place's points that another must compare: a small overlap easily fits
 GATE = 16.27  # chi2 of 3 degrees of freedom, 99.9 %: farther from the guess it is another place, or a wrong guess
 DISTINCT = 25.0  # squared Mahalanobis distance between two optima that are not one
 GUESS_WEIGHT = 0.01  # of the guess's information that goes into an alignment, so that nothing is ever unknown
@@ -36,7 +37,7 @@ class Alignment:
         pairs: points of b that lie on the same surface of a.
         residual: their rms distance to its line, metres.
         agreement: of the two grids there.
-        rival: the support of the best other place, as a fraction of this one's; 0 if there is none.
+        rival: the score of the best other place, as a fraction of this one's; 0 if there is none.
         innovation: chi2 of 3 degrees of freedom against the guess.
         refusal: why it should not be believed, with the number; None if accepted.
     """
@@ -70,29 +71,27 @@ def align(a: Surface, b: Surface, guess: UncertainPose) -> Alignment | None:
     """
     start = array_of(guess.pose)
     refined = [icp(a, b, pose) for pose in hypotheses(a, b, start, np.asarray(guess.covariance))]
-    places = [(pose, _support(a, b, pose)) for pose in refined if pose is not None]
+    places = [(pose, agreement(a.lookup, b.lookup, pose)) for pose in refined if pose is not None]
     if not places:
         return None
-    best, support = max(places, key=lambda place: place[1])
+    best, there = max(places, key=lambda place: place[1].points * _score(place[1]))
     found = fit(a, b, best)
     estimate = _estimate(guess, best, found)
     information = np.linalg.inv(estimate.covariance)
     rival = 0.0
     for pose, other in places:
         offset = se2.log(se2.between(best, pose))
-        if offset @ information @ offset > DISTINCT:
-            rival = max(rival, other)
+        if offset @ information @ offset > DISTINCT and other.points >= RIVAL_POINTS * there.points:
+            rival = max(rival, _score(other) / max(_score(there), 0.01))
     agreed = agreement(a.lookup, b.lookup, array_of(estimate.pose))
     _, moved = innovation(guess, estimate)
-    rival = rival / max(support, 1.0)
     refusal = _refusal(found, agreed, rival, moved)
     return Alignment(estimate, found.pairs, found.residual, agreed, rival, moved, refusal)
 
 
-def _support(a: Surface, b: Surface, a_T_b: FloatArray) -> float:
-    """Surface points that agree less those that do not."""
-    agreed = agreement(a.lookup, b.lookup, a_T_b)
-    return agreed.points * (agreed.hits - agreed.conflicts)
+def _score(agreed: Agreement) -> float:
+    """Share of the surface points that agree less that of those that do not."""
+    return agreed.hits - agreed.conflicts
 
 
 def _estimate(guess: UncertainPose, best: FloatArray, found: Fit) -> UncertainPose:

@@ -6,6 +6,7 @@ import math
 import numba
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import maximum_filter
 
 from frontend import se2
 from frontend.records import FloatArray
@@ -18,8 +19,8 @@ STEP = 0.2  # metres between two poses, at the middle of the overlap if they dif
 CELL = 0.1  # metres
 POINTS = 400  # of b that are looked up
 DIRECTIONS = 8  # of normals told apart
-PEAKS = 6
-WORTH = 0.6  # of the best score: lower peaks are not worth refining
+PEAKS = 10
+WORTH = 0.3  # of the best score: lower peaks are not worth refining
 PRIOR_WEIGHT = 0.01  # of the best score, for each unit of chi2 against the guess: decides between equals only
 
 # The share of a point that lies so many cells away: full within a cell, half within two.
@@ -46,7 +47,8 @@ def hypotheses(a: Surface, b: Surface, guess: FloatArray, covariance: FloatArray
     if len(chosen) == 0:
         return np.empty((0, 3))
     step_theta = STEP / max(radius, 2.0)
-    turns = np.arange(-math.ceil(reach_theta / step_theta), math.ceil(reach_theta / step_theta) + 1) * step_theta
+    side = math.ceil(reach_theta / step_theta)
+    turns: FloatArray = step_theta * np.arange(-side, side + 1, dtype=np.float64)
     shifts = (rotation(guess[2]) @ np.outer(lever, turns)).T
     points, normals = b.points[chosen], b.normals[chosen]
     field, origin = _field(a)
@@ -54,7 +56,7 @@ def hypotheses(a: Surface, b: Surface, guess: FloatArray, covariance: FloatArray
     scores = np.empty((len(turns), 2 * half + 1, 2 * half + 1), np.int32)
     _score(field, (guess[:2] - origin) / CELL, points / CELL, np.arctan2(normals[:, 1], normals[:, 0]),
            guess[2] + turns, shifts / CELL, round(STEP / CELL), scores)  # fmt: skip
-    return _peaks(scores, guess, turns, shifts, np.asarray(conditional), sigma_theta)
+    return _peaks(scores, guess, turns, shifts, conditional, sigma_theta)
 
 
 def _near_overlap(
@@ -118,7 +120,7 @@ def _peaks(
     scores: npt.NDArray[np.int32], guess: FloatArray, turns: FloatArray, shifts: FloatArray, conditional: FloatArray,
     sigma_theta: float,
 ) -> FloatArray:  # fmt: skip
-    """The best poses of the lattice, no two of them neighbours; ties go to the one nearest the guess."""
+    """The best poses of the lattice that no neighbour beats; ties go to the one nearest the guess."""
     half = scores.shape[1] // 2
     offset = STEP * np.arange(-half, half + 1)
     information = rotation(guess[2]) @ np.linalg.inv(conditional + 1e-6 * np.eye(2)) @ rotation(guess[2]).T
@@ -129,11 +131,8 @@ def _peaks(
     if best <= 0.0:
         return np.empty((0, 3))
     value = scores - PRIOR_WEIGHT * best * np.minimum(chi2, 3.0 * SIGMAS**2)
-    found: list[list[float]] = []
-    for _ in range(PEAKS):
-        t, v, u = np.unravel_index(int(np.argmax(value)), value.shape)
-        if value[t, v, u] < WORTH * best - 0.3 * best * (not found):
-            break
-        found.append([*(guess[:2] + shifts[t] + (offset[u], offset[v])), se2.wrap(guess[2] + turns[t])])
-        value[max(0, t - 2) : t + 3, max(0, v - 2) : v + 3, max(0, u - 2) : u + 3] = -np.inf
-    return np.array(found).reshape(-1, 3)
+    tops = np.flatnonzero((value == maximum_filter(value, 5, mode="constant", cval=-np.inf)) & (value > WORTH * best))
+    tops = tops[np.argsort(-value.ravel()[tops], kind="stable")][:PEAKS]
+    t, v, u = np.unravel_index(tops, value.shape)
+    xy = guess[:2] + shifts[t] + np.column_stack([offset[u], offset[v]])
+    return np.column_stack([xy, se2.wrap(guess[2] + turns[t])])

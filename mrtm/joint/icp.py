@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from frontend.records import FloatArray
+from mrtm.errors import MrtmError
 from mrtm.joint.surface import Surface, partners, rotation
 
 ROUNDS = ((0.5, 0.05, 500), (0.3, 0.05, 500), (0.15, 0.03, 4000))
@@ -18,13 +19,15 @@ LEAST = 30  # pairs of points below which there is nothing to align
 
 
 @cache
-def _registration() -> Any:
-    """Open3D's registration. Its wheel needs libusb (for cameras), which bare machines lack: a wheel brings that."""
-    import libusb_package
+def _open3d() -> Any:
+    """Open3D, loaded late: it takes half a second. Its wheel needs libusb (for cameras), which another wheel brings."""
+    try:
+        import libusb_package
 
-    ctypes.CDLL(str(libusb_package.get_library_path()), ctypes.RTLD_GLOBAL)
-    import open3d
-
+        ctypes.CDLL(str(libusb_package.get_library_path()), ctypes.RTLD_GLOBAL)
+        import open3d
+    except (ImportError, OSError) as error:
+        raise MrtmError(f"Open3D cannot be loaded ({error}); on a bare Linux: apt install libgl1 libx11-6") from error
     return open3d
 
 
@@ -39,8 +42,11 @@ def icp(a: Surface, b: Surface, guess: FloatArray) -> FloatArray | None:
 
     Returns:
         (3,) a_T_b, or None where the surfaces have too little in common.
+
+    Raises:
+        MrtmError: Open3D cannot be loaded.
     """
-    open3d = _registration()
+    open3d = _open3d()
     registration = open3d.pipelines.registration
     pose = guess
     for reach, scale, most in ROUNDS:

@@ -17,7 +17,7 @@ NEIGHBOURS = 4
 """Nearest points among which one that faces alike is looked for."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class Surface:
     """A local map made ready for many alignments.
 

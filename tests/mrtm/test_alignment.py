@@ -1,5 +1,8 @@
 """Two maps of a made-up room: alignment must find how they lie, say how sure it is, and refuse what is wrong."""
 
+import subprocess
+import sys
+
 import gtsam
 import numpy as np
 import pytest
@@ -149,3 +152,9 @@ def test_a_guess_that_is_wrong_is_not_followed(room: tuple[Surface, Surface]) ->
 
 def test_empty_maps() -> None:
     assert align(unknown(), unknown(), guess((0.1, 0.1, 0.02))) is None
+
+
+def test_open3d_is_not_imported_before_it_is_needed() -> None:
+    # It takes half a second and 70 MB, which `mrtm info` should not.
+    code = "import sys, mrtm.joint.alignment; sys.exit('open3d' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -40,8 +40,14 @@ def draw(cases: Sequence[Case], title: str, path: Path) -> None:
     line = np.array([1e-3, 10.0])
     components.plot(line, line, color=INK, linewidth=1)
     components.plot(line, 2 * line, color=INK, linewidth=0.5, linestyle=":")
-    components.set(xscale="log", yscale="log", xlim=(1e-3, 10), ylim=(1e-4, 10), xlabel="standard deviation claimed, m")
-    components.set(ylabel="error in that direction, m (dot: strong, cross: weak; one and two sigma)")
+    components.set(
+        xscale="log",
+        yscale="log",
+        xlim=(1e-3, 10),
+        ylim=(1e-4, 10),
+        xlabel="standard deviation claimed, m (dot: strong, cross: weak direction)",
+    )
+    components.set(ylabel="error in that direction, m")
     figure.suptitle(title, color=INK)
     figure.savefig(path, dpi=110)
     plt.close(figure)
