@@ -120,7 +120,8 @@ class Lookup:
 def agreement(a: Lookup, b: Lookup, a_T_b: FloatArray) -> Agreement:
     """Compare two maps at one relative pose (3,), both ways."""
     points, hits, conflicts = _counts(a, b, a_T_b[None])[0]
-    return Agreement(overlap(a, b, a_T_b), hits / max(points, 1), conflicts / max(points, 1), int(points))
+    total = max(int(points), 1)
+    return Agreement(overlap(a, b, a_T_b), int(hits) / total, int(conflicts) / total, int(points))
 
 
 def overlap(a: Lookup, b: Lookup, a_T_b: FloatArray) -> float:
@@ -128,10 +129,10 @@ def overlap(a: Lookup, b: Lookup, a_T_b: FloatArray) -> float:
     return int(np.count_nonzero(known(a, b.area, a_T_b))) * (_AREA_STEP * b.resolution) ** 2
 
 
-def scores(a: Lookup, b: Lookup, poses: FloatArray) -> FloatArray:
-    """(k,) hits less conflicts, -1 to 1, at relative poses (k, 3); -1 where fewer than LEAST_POINTS are known."""
+def scores(a: Lookup, b: Lookup, poses: FloatArray, least: int = LEAST_POINTS) -> FloatArray:
+    """(k,) hits less conflicts, -1 to 1, at relative poses (k, 3); -1 where fewer than ``least`` points are known."""
     counts = _counts(a, b, poses)
-    return np.where(counts[:, 0] >= LEAST_POINTS, (counts[:, 1] - counts[:, 2]) / np.maximum(counts[:, 0], 1), -1.0)
+    return np.where(counts[:, 0] >= least, (counts[:, 1] - counts[:, 2]) / np.maximum(counts[:, 0], 1), -1.0)
 
 
 def known(a: Lookup, points: FloatArray, pose: FloatArray) -> npt.NDArray[np.bool_]:

@@ -7,7 +7,7 @@ noise is counted with every sighting as if it were its own: they are far more ce
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -22,6 +22,16 @@ BoolArray = npt.NDArray[np.bool_]
 
 HypothesisId = tuple[str, int]
 """The robot that made the sighting and its running number: the key of its record."""
+
+
+class Slack(NamedTuple):
+    """Standard deviations of a robot's pose at a sighting that nobody stated: metres along each axis, and radians.
+
+    Clocks that differ, poses interpolated in a turn, a target that is not the robot's middle.
+    """
+
+    xy: float
+    theta: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,17 +140,22 @@ class Measurements:
     head_anchor: FloatArray
 
     @classmethod
-    def of(cls, hypotheses: Sequence[Hypothesis], rows: dict[VertexId, int]) -> "Measurements":
-        """Turn hypotheses into arrays; ``rows`` is the table of vertices."""
+    def of(cls, hypotheses: Sequence[Hypothesis], rows: dict[VertexId, int], slack: Slack) -> "Measurements":
+        """Turn hypotheses into arrays; ``rows`` is the table of vertices, ``slack`` is added to both robots' poses."""
+        more = np.diag([slack.xy, slack.xy, slack.theta]) ** 2
         n = len(hypotheses)
         measured, noise = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
         for j, hypothesis in enumerate(hypotheses):
+            observer, observed = (
+                UncertainPose(end.pose, end.covariance + more)
+                for end in (hypothesis.tail_T_observer, hypothesis.head_T_observed)
+            )
             pose = hypothesis.sighting.relative_pose()
             if pose is None:
                 measured[j, :2] = hypothesis.sighting.position
-                noise[j, :2, :2] = _position_noise(hypothesis)
+                noise[j, :2, :2] = _position_noise(hypothesis.sighting, observer.covariance, observed.covariance)
             else:
-                between = compose(compose(hypothesis.tail_T_observer, pose), inverse(hypothesis.head_T_observed))
+                between = compose(compose(observer, pose), inverse(observed))
                 measured[j], noise[j] = coordinates(between.pose), between.covariance
         return cls(
             np.array([rows[h.observer] for h in hypotheses], np.int64),
@@ -173,17 +188,15 @@ def coordinates(pose: gtsam.Pose2) -> list[float]:
     return [pose.x(), pose.y(), pose.theta()]
 
 
-def _position_noise(hypothesis: Hypothesis) -> FloatArray:
-    """(2, 2) covariance of where the observed robot seems to be, in the observer's frame, both poses' included.
+def _position_noise(sighting: Sighting, observer: FloatArray, observed: FloatArray) -> FloatArray:
+    """(2, 2) covariance of where the observed robot seems to be, in the observer's frame, both poses' (3, 3) included.
 
     The observed robot's heading there is not known: its pose covariance counts with its larger axis, all around.
     """
-    x, y = hypothesis.sighting.position.tolist()
+    x, y = sighting.position.tolist()
     lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x]])
-    observed = float(np.linalg.eigvalsh(hypothesis.head_T_observed.covariance[:2, :2])[-1])
-    observer = lever @ hypothesis.tail_T_observer.covariance @ lever.T
-    total = hypothesis.sighting.position_covariance + observer + observed * np.eye(2)
-    return np.asarray(total, np.float64)
+    widest = float(np.linalg.eigvalsh(observed[:2, :2])[-1])
+    return np.asarray(sighting.position_covariance + lever @ observer @ lever.T + widest * np.eye(2))
 
 
 def _tree(covariances: FloatArray) -> IntArray:

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from factors import UncertainPose, VertexId, adjoint_transport
+from factors import UncertainPose, adjoint_transport
 from frontend import se2
 from mrtm.joint.common_frame import CommonFrame, examine, solve
-from mrtm.joint.hypotheses import BoolArray, FloatArray, Hypothesis, IntArray, Measurements, OwnMap, RobotGraph
+from mrtm.joint.hypotheses import BoolArray, FloatArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
 from mrtm.joint.innovation import gates
-from mrtm.joint.pairs import Evidence, Finding, find, outnumbers
+from mrtm.joint.pairs import LEAST_SUPPORT, Evidence, Finding, find, outnumbers
 
 Pair = tuple[str, str]
 
@@ -27,8 +27,9 @@ class Joining:
 
     Args:
         hypotheses: between robots that have a graph, in the order of their ids.
-        graphs: each robot's own.
+        maps: each robot's own, by name, in the order of the names.
         evidence: what local maps say of an offset.
+        slack: what is added to the poses' uncertainty.
 
     Attributes:
         believed: (n,) which sightings.
@@ -42,18 +43,14 @@ class Joining:
     """
 
     def __init__(
-        self, hypotheses: Sequence[Hypothesis], graphs: Mapping[str, RobotGraph], evidence: Evidence | None
+        self, hypotheses: Sequence[Hypothesis], maps: Mapping[str, OwnMap], evidence: Evidence | None, slack: Slack
     ) -> None:
-        robots = sorted({robot for h in hypotheses for robot in h.robots})
-        wanted: dict[str, set[VertexId]] = {robot: set() for robot in robots}
-        for h in hypotheses:
-            wanted[h.observer.robot].add(h.observer)
-            wanted[h.observed.robot].add(h.observed)
-        self._maps = {robot: OwnMap.of(graphs[robot], wanted[robot]) for robot in robots}
+        self._hypotheses, self._maps = hypotheses, maps
         order = [vertex for own in self._maps.values() for vertex in own.vertices]
         table = {vertex: row for row, vertex in enumerate(order)}
         self._at = {robot: np.array([table[v] for v in own.vertices], np.int64) for robot, own in self._maps.items()}
-        self._sightings = Measurements.of(hypotheses, table)
+        self._table = table
+        self._sightings = Measurements.of(hypotheses, table, slack)
         self._poses = np.zeros((len(order), 3))
         self._frames: dict[str, tuple[CommonFrame, dict[str, int]]] = {}
         n = len(hypotheses)
@@ -70,6 +67,24 @@ class Joining:
             self.findings[pair] = find(self._maps[pair[0]], self._maps[pair[1]], sightings, evidence)
         self.contradicting: dict[Pair, bool] = {}
         self._settle(self._span())
+
+    def within(self, slack: Slack) -> BoolArray:
+        """(n,) which sightings would fit where they are believed not to, if the poses were uncertain by ``slack``."""
+        wide = Measurements.of(self._hypotheses, self._table, slack)
+        fits = np.zeros(len(self.believed), np.bool_)
+        for robots in self.components():
+            which = np.array([j for j in self._inside(robots).tolist() if not self.believed[j]], np.int64)
+            if len(which):
+                frame, _ = self._frames[robots[0]]
+                examined = examine(frame, self._among(robots, which, wide), np.zeros(len(which), np.bool_))
+                fits[which] = (examined.chi2 < self.gates[which]) & (
+                    _chance(examined.spread, self._sightings.full[which]) < CHANCE
+                )
+        return fits
+
+    def open(self) -> bool:
+        """Whether there is a pair with sightings enough, yet nothing connects its robots."""
+        return any(len(rows) >= LEAST_SUPPORT and np.isnan(self.chi2[rows]).all() for rows in self.rows.values())
 
     def components(self) -> tuple[tuple[str, ...], ...]:
         """Robots connected by believed sightings, groups of two or more."""
@@ -90,12 +105,17 @@ class Joining:
             offsets[pair] = UncertainPose(pose, adjoint_transport(root_b, covariance[0]))
         return offsets
 
-    def _among(self, robots: Sequence[str], rows: IntArray) -> Measurements:
+    def _inside(self, robots: Sequence[str]) -> IntArray:
+        """The sightings between any two of some robots, ascending."""
+        inside = [rows for (a, b), rows in self.rows.items() if a in robots and b in robots]
+        return np.sort(np.concatenate(inside))
+
+    def _among(self, robots: Sequence[str], rows: IntArray, sightings: Measurements | None = None) -> Measurements:
         """Some sightings, for a table of the vertices of some robots one after the other."""
         place = np.full(len(self._poses), -1, np.int64)
         vertices = self._vertices(robots)
         place[vertices] = np.arange(len(vertices))
-        return self._sightings.rows(rows, place)
+        return (sightings or self._sightings).rows(rows, place)
 
     def _vertices(self, robots: Sequence[str]) -> IntArray:
         return np.concatenate([self._at[robot] for robot in robots])
@@ -170,8 +190,7 @@ class Joining:
         """Solve every component, and examine every sighting within one."""
         self.chi2[:], self._decidable[:], self._frames = np.nan, False, {}
         for robots in self.components():
-            inside = [rows for (a, b), rows in self.rows.items() if a in robots and b in robots]
-            which, vertices = np.sort(np.concatenate(inside)), self._vertices(robots)
+            which, vertices = self._inside(robots), self._vertices(robots)
             sightings, believed = self._among(robots, which), self.believed[which]
             frame = solve([self._maps[robot] for robot in robots], sightings, believed, self._poses[vertices])
             self._poses[vertices] = frame.poses

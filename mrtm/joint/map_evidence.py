@@ -13,7 +13,17 @@ import numpy as np
 
 from factors import UncertainPose, VertexId, compose, inverse
 from frontend import se2
-from mrtm.joint.agreement import Agreement, Decision, FloatArray, Lookup, agreement, known, overlap, scores
+from mrtm.joint.agreement import (
+    LEAST_POINTS,
+    Agreement,
+    Decision,
+    FloatArray,
+    Lookup,
+    agreement,
+    known,
+    overlap,
+    scores,
+)
 from mrtm.joint.hypotheses import RobotGraph, coordinates
 
 LEAST_OVERLAP = 20.0
@@ -22,7 +32,7 @@ LEAST_OVERLAP = 20.0
 AGREEING = (0.65, 0.12)
 """At least so many hits and at most so many conflicts."""
 
-CONTRADICTING = (0.5, 0.2)
+CONTRADICTING = (0.4, 0.3)
 """At most so many hits and at least so many conflicts."""
 
 UNIQUE = 0.15
@@ -31,7 +41,7 @@ UNIQUE = 0.15
 SIGMAS = 3.0
 """How far the fit may move a pose, in standard deviations of each axis."""
 
-WIDEST = (0.8, 0.15)
+WIDEST = (1.2, 0.25)
 """Metres and radians beyond which a pose is too uncertain to be fitted, and its maps are not asked."""
 
 MOST_PAIRS = 3
@@ -58,7 +68,7 @@ class Fit:
     def decision(self) -> Decision:
         """What it says; the bounds come from true and false overlaps of real local maps."""
         found = self.agreement
-        if found.overlap < LEAST_OVERLAP or found.points == 0:
+        if found.overlap < LEAST_OVERLAP or found.points < LEAST_POINTS:
             return Decision.UNDECIDED
         if found.hits <= CONTRADICTING[0] and found.conflicts >= CONTRADICTING[1]:
             return Decision.CONTRADICTS
@@ -71,15 +81,19 @@ def fit(a: Lookup, b: Lookup, guess: FloatArray, half: FloatArray) -> Fit:
     pose = guess
     for (step, turn), width in zip(_STEPS, (half, _FINE), strict=True):
         tried = se2.compose(pose, _around(width, step, turn))
-        pose = tried[int(np.argmax(scores(a, b, tried)))]
+        score = scores(a, b, tried)
+        if score.max() > scores(a, b, pose[None])[0]:
+            pose = tried[int(np.argmax(score))]
     axis = _weak_direction(a, b, pose)
     way = np.concatenate([_SHIFTS, -_SHIFTS])
     moved = []
     for angle in (axis, axis + 0.5 * np.pi):
         shift = np.outer(way, [np.cos(angle), np.sin(angle), 0.0])
         moved.append(se2.compose((pose + shift)[:, None], _around(_FINE, 0.1, 0.02)[None]).reshape(-1, 3))
-    elsewhere = scores(a, b, np.concatenate(moved)).max()
-    return Fit(pose, agreement(a, b, pose), float(scores(a, b, pose[None])[0] - elsewhere))
+    here = agreement(a, b, pose)
+    # Moved sideways two corridors touch wall to wall, which is no overlap: that leaves few of the points.
+    elsewhere = scores(a, b, np.concatenate(moved), max(LEAST_POINTS, here.points // 2)).max()
+    return Fit(pose, here, float(scores(a, b, pose[None])[0] - elsewhere))
 
 
 class MapEvidence:
