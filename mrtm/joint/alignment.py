@@ -8,7 +8,7 @@ import numpy as np
 from factors import UncertainPose
 from factors.noise import FloatArray
 from frontend import se2
-from mrtm.joint.agreement import Agreement, agreement
+from mrtm.joint.agreement import Agreement, agreement, scores
 from mrtm.joint.correlative import hypotheses
 from mrtm.joint.fit import Fit, fit
 from mrtm.joint.icp import icp
@@ -24,6 +24,8 @@ MOST_RIVAL = 0.9  # of the best place's score that another may have; long walls 
 RIVAL_POINTS = 0.3  # of the best place's points that another must compare: a small overlap easily fits
 GATE = 16.27  # chi2 of 3 degrees of freedom, 99.9 %: farther from the guess it is another place, or a wrong guess
 DISTINCT = 25.0  # squared Mahalanobis distance between two optima that are not one
+SLIDING = 0.9  # of the score at a slid position from which on the position is not seen
+PROBES = (-1.0, -0.6, -0.3, 0.3, 0.6, 1.0)  # metres slid to see whether the position matters
 GUESS_WEIGHT = 0.01  # of the guess's information that goes into an alignment, so that nothing is ever unknown
 
 
@@ -76,7 +78,7 @@ def align(a: Surface, b: Surface, guess: UncertainPose) -> Alignment | None:
         return None
     best, there = max(places, key=lambda place: place[1].points * _score(place[1]))
     found = fit(a, b, best)
-    estimate = _estimate(guess, best, found)
+    estimate = _estimate(guess, best, _seen(a, b, best, found, _score(there)), found.drift)
     information = np.linalg.inv(estimate.covariance)
     rival = 0.0
     for pose, other in places:
@@ -94,13 +96,28 @@ def _score(agreed: Agreement) -> float:
     return agreed.hits - agreed.conflicts
 
 
-def _estimate(guess: UncertainPose, best: FloatArray, found: Fit) -> UncertainPose:
+def _seen(a: Surface, b: Surface, best: FloatArray, found: Fit, score: float) -> FloatArray:
+    """The information (3, 3) of a fit, without its weakest direction if sliding along that hardly matters.
+
+    At an optimum along a corridor a few points at doors fix the position to centimetres, at any door.
+    """
+    information = found.information
+    xy, mixed, theta = information[:2, :2], information[:2, 2], max(information[2, 2], 1e-9)
+    weakest = np.linalg.eigh(xy - np.outer(mixed, mixed) / theta)[1][:, 0]
+    slide = np.append(weakest, -mixed @ weakest / theta)  # turning as it fits best
+    probes = se2.compose(best, np.outer(PROBES, slide))
+    seen = information @ slide
+    if scores(a.lookup, b.lookup, probes).max() <= SLIDING * score or slide @ seen <= 0.0:
+        return information
+    return np.asarray(information - np.outer(seen, seen) / (slide @ seen))
+
+
+def _estimate(guess: UncertainPose, best: FloatArray, information: FloatArray, drift: FloatArray) -> UncertainPose:
     """The optimum, but what the maps do not see as guessed; along a bare corridor the optimum is anywhere."""
-    prior = GUESS_WEIGHT * np.linalg.inv(guess.covariance)
-    covariance = np.linalg.inv(found.information + prior)
+    covariance = np.linalg.inv(information + GUESS_WEIGHT * np.linalg.inv(guess.covariance))
     offset = gtsam.Pose2.Logmap(guess.pose.between(pose_of(best)))
-    seen = covariance @ found.information @ offset
-    return UncertainPose(guess.pose.compose(gtsam.Pose2.Expmap(seen)), covariance + found.drift)
+    seen = covariance @ information @ offset
+    return UncertainPose(guess.pose.compose(gtsam.Pose2.Expmap(seen)), covariance + drift)
 
 
 def _refusal(found: Fit, agreed: Agreement, rival: float, moved: float) -> str | None:
