@@ -1,14 +1,18 @@
 """Several robots in one frame: least squares over their own maps and the sightings believed, and what it predicts.
 
 The robots' vertices are the variables, each robot's own map enters as the tree of ``OwnMap``, a sighting as one
-measurement between two vertices. Small and dense: it serves to judge sightings; the joint map itself is iSAM2's.
+measurement between two vertices. It serves to judge sightings; the joint map itself is iSAM2's.
+
+Solved by SuperLU one right side at a time, inverted by LAPACK's LU: Cholesky and triangular solves of OpenBLAS start
+threads even for small matrices, which on a busy machine costs a thousand times the work.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import bsr_array, csc_array
+from scipy.sparse.linalg import SuperLU, splu
 
 from frontend import se2
 from mrtm.joint.hypotheses import BoolArray, FloatArray, IntArray, Measurements, OwnMap
@@ -57,6 +61,9 @@ def solve(maps: Sequence[OwnMap], sightings: Measurements, believed: BoolArray, 
     """Gauss-Newton from ``start`` (m, 3), the vertices of ``maps`` one after the other; the first stays fixed.
 
     The ``believed`` (n,) sightings must connect all maps.
+
+    Raises:
+        LinAlgError: they do not fix where the maps lie.
     """
     tails, heads, measured, informations = _own_edges(maps)
     chosen = np.flatnonzero(believed)
@@ -73,14 +80,17 @@ def solve(maps: Sequence[OwnMap], sightings: Measurements, believed: BoolArray, 
         information = np.concatenate([informations, turned @ weights @ derivative])
         gradient = np.concatenate([_times(informations, own), _times(turned @ weights, residual)])
         matrix, vector = _normal_equations(len(start), tails, heads, predicted, information, gradient)
-        factor = cho_factor(matrix[3:, 3:])
+        factor = _factorised(matrix)
         step = np.zeros((len(start), 3))
-        step[1:] = cho_solve(factor, vector[3:]).reshape(-1, 3)
+        step[1:] = factor.solve(vector[3:]).reshape(-1, 3)
         poses = se2.compose(poses, exp(step))
         if np.abs(step).max() < _SETTLED:
             break
-    covariance = np.zeros_like(matrix)
-    covariance[3:, 3:] = np.linalg.inv(matrix[3:, 3:])  # many right sides by cho_solve: threads, slower a hundredfold
+    covariance = np.zeros(matrix.shape)
+    covariance[3:, 3:] = np.linalg.inv(matrix[3:, 3:].toarray())
+    covariance = 0.5 * (covariance + covariance.T)
+    if not np.all(np.diag(covariance) >= 0.0):  # NaN as well
+        raise np.linalg.LinAlgError("the sightings do not fix the frames")
     m = len(start)
     return CommonFrame(poses, covariance.reshape(m, 3, m, 3).transpose(0, 2, 1, 3))
 
@@ -141,20 +151,28 @@ def _own_edges(maps: Sequence[OwnMap]) -> tuple[IntArray, IntArray, FloatArray, 
 
 def _normal_equations(
     m: int, tails: IntArray, heads: IntArray, predicted: FloatArray, information: FloatArray, gradient: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[csc_array, FloatArray]:
     """(3m, 3m) matrix and (3m,) vector; a step of the head counts as it is, one of the tail as seen from the head."""
     back = -adjoint(se2.inverse(predicted))
     turned = np.swapaxes(back, -1, -2)
-    blocks = np.zeros((m, m, 3, 3))
     mixed = turned @ information
-    np.add.at(blocks, (tails, tails), mixed @ back)
-    np.add.at(blocks, (heads, heads), information)
-    np.add.at(blocks, (tails, heads), mixed)
-    np.add.at(blocks, (heads, tails), np.swapaxes(mixed, -1, -2))
+    rows, columns = np.concatenate([tails, heads, tails, heads]), np.concatenate([tails, heads, heads, tails])
+    blocks = np.concatenate([mixed @ back, information, mixed, np.swapaxes(mixed, -1, -2)])
+    order = np.argsort(rows, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=m))])
+    matrix = bsr_array((blocks[order], columns[order], starts), shape=(3 * m, 3 * m)).tocsc()
     vector = np.zeros((m, 3))
     np.add.at(vector, tails, _times(turned, gradient))
     np.add.at(vector, heads, gradient)
-    return blocks.transpose(0, 2, 1, 3).reshape(3 * m, 3 * m), vector.reshape(-1)
+    return matrix, vector.reshape(-1)
+
+
+def _factorised(matrix: csc_array) -> SuperLU:
+    """The factors of the matrix without the fixed pose."""
+    try:
+        return splu(matrix[3:, 3:], permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    except RuntimeError as error:  # exactly singular
+        raise np.linalg.LinAlgError(str(error)) from error
 
 
 def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
