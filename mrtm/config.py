@@ -60,14 +60,16 @@ class TopologyParameters(Section):
 class TeamParameters(Section):
     """Meetings of robots (M9 to M11)."""
 
-    sighting_xy: Annotated[
-        float,
-        Parameter("m", "standard deviation of what a sighting's own does not count, as bad timing", paper="0", ge=0),
-    ] = 0.2
-    sighting_theta: Annotated[
-        float, Parameter("rad", "the same of its bearing and heading at the robots", paper="0", ge=0)
-    ] = 0.2
     exchange_interval: Annotated[float, Parameter("s", "between two exchanges while robots see each other", gt=0)] = 5.0
+
+
+@dataclass(frozen=True)
+class JointParameters(Section):
+    """The joint map (M13)."""
+
+    alignments: Annotated[
+        int, Parameter("", "pairs of local maps aligned after an event, at most; 0 for none", paper="0", ge=0)
+    ] = 12
 
 
 class Config(BaseModel):
@@ -83,6 +85,7 @@ class Config(BaseModel):
     frontend: FilterParameters = Field(default_factory=FilterParameters)
     topology: TopologyParameters = Field(default_factory=TopologyParameters)
     team: TeamParameters = Field(default_factory=TeamParameters)
+    joint: JointParameters = Field(default_factory=JointParameters)
 
     @model_validator(mode="after")
     def _check(self) -> "Config":
@@ -96,6 +99,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "frontend": {"particles": 40, "sensing_range": 10.0, "map_width": 20.0, "travel_square": 10.0},
         "topology": {"projection": "dijkstra"},
+        "joint": {"alignments": 0},
     },
 }
 

@@ -13,13 +13,13 @@ class Component:
 
     Attributes:
         robots: ascending.
-        graph: all their edges, and the fusing edges between them.
-        fusing: the edges between robots, by their ids.
+        graph: all their edges, and those added; without added ones the robot's own graph.
+        added: what came to them: edges between robots, and alignments of maps, by their ids.
     """
 
     robots: tuple[str, ...]
     graph: JointGraph
-    fusing: dict[EdgeId, GraphEdge] = field(default_factory=dict)
+    added: dict[EdgeId, GraphEdge] = field(default_factory=dict)
 
 
 class JointMap:
@@ -91,64 +91,61 @@ class JointMap:
             graph.update(add=add, replace=replace)
         return {edge_id: edge for edge_id, edge in waiting.items() if edge_id not in present}
 
-    def join(self, fusing: Iterable[GraphEdge]) -> None:
-        """Let ``fusing`` be all the edges between robots (M11): robots come into one frame, or fall apart again.
+    def join(self, added: Iterable[GraphEdge]) -> None:
+        """Let ``added`` be all the edges beside the robots' own (M11, M13): robots come into one frame, or fall apart.
 
         Edges that fix a pose join; a range and bearing between robots that nothing else joins is left out.
         """
-        edges = {edge.id: edge for edge in sorted(fusing, key=lambda e: e.id)}
-        for robots in _connected(self._own, [e for e in edges.values() if e.estimate is not None]):
-            mine = {i: e for i, e in edges.items() if {e.tail.robot, e.head.robot} <= set(robots)}
+        edges = {edge.id: edge for edge in sorted(added, key=lambda e: e.id)}
+        for robots in self.connected(edges.values()):
+            mine = {i: e for i, e in edges.items() if _ends(e) <= set(robots)}
             component = self._component[robots[0]]
-            if component.robots == robots:
+            if component.robots == robots and bool(component.added) == bool(mine):
                 _exchange(component, mine)
-                continue
-            component = Component(robots, self._graph_of(robots, mine), mine)
-            self._component.update(dict.fromkeys(robots, component))
+            else:
+                component = Component(robots, self._graph_of(robots, mine), mine)
+                self._component.update(dict.fromkeys(robots, component))
 
-    def _graph_of(self, robots: tuple[str, ...], fusing: dict[EdgeId, GraphEdge]) -> JointGraph:
+    def connected(self, edges: Iterable[GraphEdge]) -> list[tuple[str, ...]]:
+        """The robots that edges would bring together, names ascending."""
+        group = {robot: {robot} for robot in self._own}
+        for edge in edges:
+            a, b = group[edge.tail.robot], group[edge.head.robot]
+            if edge.estimate is not None and a is not b:
+                a |= b
+                group.update(dict.fromkeys(b, a))
+        return sorted({tuple(sorted(members)) for members in group.values()})
+
+    def _graph_of(self, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> JointGraph:
         """The robots' own graphs made one: the root's first, the others in the order in which they are reached."""
-        if len(robots) == 1:
+        if not added:
             return self._own[robots[0]]
         root = self._owner if self._owner in robots and self._owner is not None else robots[0]
         graph = JointGraph(VertexId(root, 0))
         graph.update(add=self._own[root].edges())
-        reached, left = {root}, dict(fusing)
-        while left:
-            robot = next(r for e in left.values() if e.estimate is not None for r in _other(e, reached))
-            between = [e for e in left.values() if {e.tail.robot, e.head.robot} <= reached | {robot}]
-            bridge, *more = sorted(between, key=lambda e: e.estimate is None)
-            graph.merge(self._own[robot], bridge, more)
-            reached.add(robot)
-            left = {i: e for i, e in left.items() if not {e.tail.robot, e.head.robot} <= reached}
+        reached = {root}
+        graph.update(add=[e for e in added.values() if _ends(e) == reached])
+        while len(reached) < len(robots):
+            bridge = next(e for e in added.values() if e.estimate and _ends(e) & reached and _ends(e) - reached)
+            both = reached | _ends(bridge)
+            more = [e for e in added.values() if e is not bridge and _ends(e) <= both and not _ends(e) <= reached]
+            graph.merge(self._own[(both - reached).pop()], bridge, more)
+            reached = both
         return graph
 
 
-def _exchange(component: Component, fusing: dict[EdgeId, GraphEdge]) -> None:
-    """Bring a component whose robots stay the same to other fusing edges."""
-    before = component.fusing
-    add = [e for i, e in fusing.items() if i not in before]
-    replace = [e for i, e in fusing.items() if i in before and e.version > before[i].version]
-    gone = [i for i in before if i not in fusing]
+def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
+    """Bring a component whose robots stay the same to other added edges."""
+    before = component.added
+    add = [e for i, e in added.items() if i not in before]
+    replace = [e for i, e in added.items() if i in before and e.version > before[i].version]
+    gone = [i for i in before if i not in added]
     if add:
         component.graph.update(add=add)  # first, so that no robot is cut off in between
     if replace or gone:
         component.graph.update(replace=replace, remove=gone)
-    component.fusing = fusing
+    component.added = added
 
 
-def _other(edge: GraphEdge, reached: set[str]) -> list[str]:
-    """The robot at one end of an edge whose other end is reached; else none."""
-    ends = {edge.tail.robot, edge.head.robot}
-    return sorted(ends - reached) if ends & reached else []
-
-
-def _connected(robots: Iterable[str], edges: Iterable[GraphEdge]) -> list[tuple[str, ...]]:
-    """The robots by connected component, names ascending."""
-    group = {robot: {robot} for robot in robots}
-    for edge in edges:
-        a, b = group[edge.tail.robot], group[edge.head.robot]
-        if a is not b:
-            a |= b
-            group.update(dict.fromkeys(b, a))
-    return sorted({tuple(sorted(members)) for members in group.values()})
+def _ends(edge: GraphEdge) -> set[str]:
+    return {edge.tail.robot, edge.head.robot}

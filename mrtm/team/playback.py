@@ -9,7 +9,7 @@ import numpy as np
 
 from factors import VertexId
 from frontend import se2
-from mrtm.config import Config, TeamParameters
+from mrtm.config import Config
 from mrtm.joint.consistency import Verdict
 from mrtm.result import EdgeFate, Meeting, RunResult, SightingFate, TeamStory, Trajectory
 from mrtm.robot.poses import array_of
@@ -19,7 +19,7 @@ from mrtm.team.member import MemberRun
 from mrtm.team.records import Record, SightingRecord
 from mrtm.team.session_file import TimedSighting
 from mrtm.team.store import item_of
-from mrtm.team.teammate import Teammate
+from mrtm.team.teammate import ROUNDS, Teammate
 from mrtm.timing import Stages
 
 LINGER = 0.5  # seconds that robots stay in contact after a sighting, so that they know where they were
@@ -41,27 +41,25 @@ def play(
         sightings: between them, by team time.
         report: told now and then which fraction of the clock has passed.
     """
-    playback = _Playback(runs, sightings, config.team)
+    playback = _Playback(runs, sightings, config)
     playback.play(report)
     return playback.result(config)
 
 
 class _Playback:
-    def __init__(
-        self, runs: Sequence[MemberRun], sightings: Sequence[TimedSighting], parameters: TeamParameters
-    ) -> None:
+    def __init__(self, runs: Sequence[MemberRun], sightings: Sequence[TimedSighting], config: Config) -> None:
         self._runs = runs
-        self._parameters = parameters
-        self._team = {run.robot: Teammate(run.robot, parameters) for run in runs}
-        self._listener = Teammate(None, parameters)
+        self._config = config
+        self._stages = Stages()
+        self._team = {run.robot: Teammate(run.robot, config, self._stages) for run in runs}
+        self._listener = Teammate(None, config, self._stages)
         self._sightings = _numbered(sightings)
         self._meetings: list[Meeting] = []
         self._frames: list[tuple[float, frozenset[str]]] = []  # team time and robots of every new component
-        self._stages = Stages()
 
     def play(self, report: Callable[[float], None]) -> None:
         end = max([r.records[-1].time for r in self._runs if r.records] + [s.time for s in self._sightings])
-        meetings = _meetings(self._sightings, self._parameters.exchange_interval)
+        meetings = _meetings(self._sightings, self._config.team.exchange_interval)
         told = deque[tuple[float, Record]](
             heapq.merge(
                 *([(r.time, r) for r in run.records] for run in self._runs),
@@ -76,9 +74,9 @@ class _Playback:
             report(time / end)
         for _, record in told:
             self._write_down(record)
-        for teammate in (*self._team.values(), self._listener):
-            with self._stages("joint map"):
-                teammate.think()
+        for teammate in (*(self._team.values() if len(self._team) > 1 else ()), self._listener):
+            teammate.think()
+            teammate.align(ROUNDS)
 
     def _write_down(self, record: Record) -> None:
         with self._stages("exchange"):
@@ -92,8 +90,8 @@ class _Playback:
         with self._stages("exchange"):
             traffic = exchange(one.store, other.store)
         for teammate in (one, other):
-            with self._stages("joint map"):
-                teammate.think()
+            teammate.think()
+            teammate.align()
             robots_in = frozenset(teammate.joint.component(robots[0]).robots)
             self._frames.append((time, robots_in))
         verdict, reason = _verdict(one, robots)

@@ -4,28 +4,28 @@ from collections.abc import Iterator, Mapping
 from weakref import WeakValueDictionary
 
 from factors import VertexId
-from mrtm.joint.agreement import Lookup
+from mrtm.joint.surface import Surface
 from mrtm.team.records import Key, Kind, MapRecord
 from mrtm.team.store import Store
 
 # Robots that are played in one process share what they have made of a map; the key is the hash of the record.
-_shared: WeakValueDictionary[bytes, Lookup] = WeakValueDictionary()
+_shared: WeakValueDictionary[bytes, Surface] = WeakValueDictionary()
 
 
-class Lookups(Mapping[VertexId, Lookup]):
+class Surfaces(Mapping[VertexId, Surface]):
     """Every vertex of which a store has a map."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._kept: dict[VertexId, Lookup] = {}  # else what nobody holds is forgotten
+        self._kept: dict[VertexId, Surface] = {}  # else what nobody holds is forgotten
 
-    def __getitem__(self, vertex: VertexId) -> Lookup:
+    def __getitem__(self, vertex: VertexId) -> Surface:
         item = self._store.item(Key(Kind.MAP, vertex.robot, vertex.index))
         found = _shared.get(item.hash)
         if found is None:
             record = item.record
             assert isinstance(record, MapRecord)
-            found = _shared[item.hash] = Lookup.of(record)
+            found = _shared[item.hash] = Surface.of(record)
         self._kept[vertex] = found
         return found
 

@@ -1,0 +1,108 @@
+"""Keeps the alignments of a joint map up to date (M13, on line): which pairs of maps, when again, with what outcome.
+
+An alignment is tried when two maps of a component may overlap. It is tried again when one of the maps has changed, or
+when the estimate has moved so far that the old answer was to another question.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
+from mrtm.joint.alignment import Alignment, align
+from mrtm.joint.candidates import pairs
+from mrtm.joint.graph import JointGraph
+from mrtm.joint.surface import Surface
+
+Pair = tuple[VertexId, VertexId]
+
+MOVED = 4.0
+"""Squared Mahalanobis distance, as the first guess saw it, beyond which a new guess is another question."""
+
+CONTRADICTED = 16.27
+"""chi2 of 3 degrees of freedom, 99.9 %: an alignment so far from the joint estimate is taken back."""
+
+SURER = 4.0
+"""Times the volume of the first guess's covariance over the new one's for a refused pair to be worth another look."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """An alignment that was tried.
+
+    Attributes:
+        maps: the two as they were.
+        guess: a_T_b as it was known.
+        found: what came of it; None if nothing of the maps could meet.
+        edge: if it is believed.
+        refusal: why not, in words; empty if it is.
+    """
+
+    maps: tuple[Surface, Surface]
+    guess: UncertainPose
+    found: Alignment | None
+    edge: Edge | None
+    refusal: str
+
+
+class Aligner:
+    """The alignments of one joint map."""
+
+    def __init__(self) -> None:
+        self.attempts: dict[Pair, Attempt] = {}
+        self._versions: dict[Pair, int] = {}
+
+    def edges(self, vertices: set[VertexId]) -> list[Edge]:
+        """Those believed between some vertices."""
+        return [a.edge for pair, a in self.attempts.items() if a.edge is not None and set(pair) <= vertices]
+
+    def look(self, graph: JointGraph, maps: Mapping[VertexId, Surface], most: int) -> bool:
+        """Try the pairs of a component that are due, at most so many; whether any was.
+
+        Args:
+            graph: of the component; its edges are not touched.
+            maps: of its closed vertices.
+        """
+        poses = graph.estimates()
+        near = pairs({v: maps[v] for v in poses if v in maps}, poses, graph.relative, most=len(poses) ** 2)
+        due = [c for c in near if self._due((c.a, c.b), (maps[c.a], maps[c.b]), c.guess)][:most]
+        for a, b, guess in due:
+            self._try((a, b), (maps[a], maps[b]), guess)
+        return bool(due)
+
+    def take_back(self, graph: JointGraph) -> list[EdgeId]:
+        """Give up alignments in ``graph`` that the joint estimate contradicts; their edges are to be removed."""
+        gone = []
+        for pair, attempt in self.attempts.items():
+            if attempt.edge is None or attempt.edge.id not in {edge.id for edge in graph.edges()}:
+                continue
+            chi2 = graph.chi2(attempt.edge.id)
+            if chi2 > CONTRADICTED:
+                reason = f"taken back: chi2 {chi2:.1f} from the joint estimate, more than {CONTRADICTED}"
+                self.attempts[pair] = Attempt(attempt.maps, attempt.guess, attempt.found, None, reason)
+                gone.append(attempt.edge.id)
+        return gone
+
+    def _due(self, pair: Pair, maps: tuple[Surface, Surface], guess: UncertainPose) -> bool:
+        old = self.attempts.get(pair)
+        if old is None or old.maps[0] is not maps[0] or old.maps[1] is not maps[1]:
+            return True
+        if old.edge is not None:
+            return False
+        offset = gtsam.Pose2.Logmap(old.guess.pose.between(guess.pose))
+        moved = float(offset @ np.linalg.solve(old.guess.covariance, offset))
+        return moved > MOVED or np.linalg.det(old.guess.covariance) > SURER**2 * np.linalg.det(guess.covariance)
+
+    def _try(self, pair: Pair, maps: tuple[Surface, Surface], guess: UncertainPose) -> None:
+        found = align(*maps, guess)
+        edge, refusal = None, "nothing of the maps can meet"
+        if found is not None:
+            refusal = found.refusal or ""
+            if not refusal:
+                version = self._versions[pair] = self._versions.get(pair, -1) + 1
+                name = EdgeId(f"{pair[0]}={pair[1]}", 0)
+                pose, covariance = found.estimate
+                edge = Edge(name, version, EdgeKind.ALIGNMENT, *pair, pose, covariance)
+        self.attempts[pair] = Attempt(maps, guess, found, edge, refusal)
