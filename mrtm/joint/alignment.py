@@ -24,8 +24,8 @@ MOST_RIVAL = 0.9  # of the best place's score that another may have; long walls 
 RIVAL_POINTS = 0.3  # of the best place's points that another must compare: a small overlap easily fits
 GATE = 16.27  # chi2 of 3 degrees of freedom, 99.9 %: farther from the guess it is another place, or a wrong guess
 DISTINCT = 25.0  # squared Mahalanobis distance between two optima that are not one
-SLIDING = 0.9  # of the score at a slid position from which on the position is not seen
-PROBES = (-1.0, -0.6, -0.3, 0.3, 0.6, 1.0)  # metres slid to see whether the position matters
+SLIDING = 0.92  # of the score at a slid position from which on the position is not seen
+PROBES = (-1.0, -0.6, 0.6, 1.0)  # metres slid to see whether the position matters
 GUESS_WEIGHT = 0.01  # of the guess's information that goes into an alignment, so that nothing is ever unknown
 
 
