@@ -58,6 +58,10 @@ class Aligner:
         """Those believed between some vertices."""
         return [a.edge for pair, a in self.attempts.items() if a.edge is not None and set(pair) <= vertices]
 
+    def joins(self, one: str, other: str) -> bool:
+        """Whether an alignment between maps of two robots is believed."""
+        return any(a.edge and {v.robot for v in pair} == {one, other} for pair, a in self.attempts.items())
+
     def look(self, graph: JointGraph, maps: Mapping[VertexId, Surface], most: int) -> bool:
         """Try the pairs of a component that are due, at most so many; whether any was.
 
@@ -66,10 +70,15 @@ class Aligner:
             maps: of its closed vertices.
         """
         poses = graph.estimates()
-        near = pairs({v: maps[v] for v in poses if v in maps}, poses, graph.relative, most=len(poses) ** 2)
-        due = [c for c in near if self._due((c.a, c.b), (maps[c.a], maps[c.b]), c.guess)][:most]
+        closed = {v: maps[v] for v in poses if v in maps}
+
+        def wanted(a: VertexId, b: VertexId) -> bool:
+            return not self._aligned((a, b), (closed[a], closed[b]))
+
+        near = pairs(closed, poses, graph.relative, wanted, most=len(poses) ** 2)
+        due = [c for c in near if self._due((c.a, c.b), (closed[c.a], closed[c.b]), c.guess)][:most]
         for a, b, guess in due:
-            self._try((a, b), (maps[a], maps[b]), guess)
+            self._try((a, b), (closed[a], closed[b]), guess)
         return bool(due)
 
     def take_back(self, graph: JointGraph) -> list[EdgeId]:
@@ -85,12 +94,16 @@ class Aligner:
                 gone.append(attempt.edge.id)
         return gone
 
-    def _due(self, pair: Pair, maps: tuple[Surface, Surface], guess: UncertainPose) -> bool:
+    def _aligned(self, pair: Pair, maps: tuple[Surface, Surface]) -> bool:
+        """Whether the pair, as its maps are now, has an alignment that is believed."""
         old = self.attempts.get(pair)
-        if old is None or old.maps[0] is not maps[0] or old.maps[1] is not maps[1]:
+        return old is not None and old.edge is not None and _unchanged(old, maps)
+
+    def _due(self, pair: Pair, maps: tuple[Surface, Surface], guess: UncertainPose) -> bool:
+        """Whether a pair without an alignment is worth a try, the first or another."""
+        old = self.attempts.get(pair)
+        if old is None or not _unchanged(old, maps):
             return True
-        if old.edge is not None:
-            return False
         offset = gtsam.Pose2.Logmap(old.guess.pose.between(guess.pose))
         moved = float(offset @ np.linalg.solve(old.guess.covariance, offset))
         return moved > MOVED or np.linalg.det(old.guess.covariance) > SURER**2 * np.linalg.det(guess.covariance)
@@ -106,3 +119,7 @@ class Aligner:
                 pose, covariance = found.estimate
                 edge = Edge(name, version, EdgeKind.ALIGNMENT, *pair, pose, covariance)
         self.attempts[pair] = Attempt(maps, guess, found, edge, refusal)
+
+
+def _unchanged(attempt: Attempt, maps: tuple[Surface, Surface]) -> bool:
+    return attempt.maps[0] is maps[0] and attempt.maps[1] is maps[1]

@@ -1,6 +1,6 @@
 """Which closed maps are worth aligning after an event: those that are likely to overlap, not all pairs of all."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import gtsam
@@ -30,7 +30,7 @@ def pairs(
     maps: Mapping[VertexId, Surface],
     poses: Mapping[VertexId, gtsam.Pose2],
     relative: Callable[[VertexId, VertexId], UncertainPose],
-    changed: Collection[VertexId] | None = None,
+    wanted: Callable[[VertexId, VertexId], bool] = lambda a, b: True,
     most: int = MOST,
 ) -> list[Candidate]:
     """The pairs of maps to align, the largest overlap first.
@@ -39,14 +39,14 @@ def pairs(
         maps: of closed vertices of one component.
         poses: joint_T_local of at least these.
         relative: a_T_b and its covariance in the frame of b, such as ``JointGraph.relative``; asked of near pairs only.
-        changed: the vertices whose maps or poses the event changed: a pair has one of them. All by default.
+        wanted: whether a pair, a before b, is worth a look at all. All by default.
         most: pairs at most.
     """
     circles = {vertex: _circle(surface, poses[vertex]) for vertex, surface in maps.items() if len(surface.points)}
     found: list[tuple[float, Candidate]] = []
     for a in sorted(circles):
         for b in sorted(circles):
-            if a >= b or not (changed is None or a in changed or b in changed):
+            if a >= b or not wanted(a, b):
                 continue
             apart = np.hypot(*(circles[a][:2] - circles[b][:2])) - circles[a][2] - circles[b][2]
             if apart > MAX_XY:

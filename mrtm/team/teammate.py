@@ -12,12 +12,18 @@ from mrtm.joint.aligner import Aligner
 from mrtm.joint.consistency import Judgement, Verdict, judge
 from mrtm.joint.hypotheses import HypothesisId
 from mrtm.joint.joint_map import Component, JointMap
-from mrtm.joint.map_evidence import MapEvidence
+from mrtm.team.evidence import Evidence
 from mrtm.team.meeting import anchored, bridges, fusing_edges, sightings
 from mrtm.team.records import AnchorRecord, EdgeRecord, Key, SightingRecord, VertexRecord
 from mrtm.team.store import R, Store
 from mrtm.team.surfaces import Surfaces
 from mrtm.timing import Stages
+
+_Conclusion = tuple[Mapping[HypothesisId, Judgement], list[Edge | SightingEdge]]
+
+# Robots that are played in one process share what they conclude from the same records; the key is the store's hash.
+_concluded: dict[bytes, _Conclusion] = {}
+KEPT = 8
 
 ROUNDS = 10  # of alignments until the estimate has come to rest, at most
 
@@ -46,6 +52,7 @@ class Teammate:
         self._config = config
         self._stages = stages
         self._maps = Surfaces(self.store)
+        self._evidence = Evidence(self._maps, self.joint, self.aligner)
         self._fusing: dict[EdgeId, Edge | SightingEdge] = {}
         self._told: dict[Key, int] = {}  # version of each record that the joint map knows
 
@@ -89,17 +96,24 @@ class Teammate:
 
     def _fuse(self) -> None:
         """M11: judge all sightings anew, and let the accepted ones be the fusing edges."""
-        graphs = self.joint.robots
         with self._stages("judging"):
-            found = {hypothesis.id: hypothesis for hypothesis in sightings(self.store, graphs)}
-            evidence = MapEvidence({vertex: surface.lookup for vertex, surface in self._maps.items()}, graphs)
-            consistency = judge(found.values(), graphs, evidence)
-        self.judgements = consistency.judgements
-        believed = [found[key] for key, j in self.judgements.items() if j.verdict is Verdict.ACCEPTED]
-        edges = fusing_edges(anchored(hypothesis, consistency.slack) for hypothesis in believed)
-        edges += bridges(consistency.offsets, edges)
+            held = self.store.summary()
+            if held not in _concluded:
+                _concluded[held] = self._conclude()
+                while len(_concluded) > KEPT:
+                    del _concluded[next(iter(_concluded))]
+            self.judgements, edges = _concluded[held]
         self._fusing = {edge.id: self._versioned(edge) for edge in edges}
         self._enter()
+
+    def _conclude(self) -> "_Conclusion":
+        """What the records say of the sightings, and the edges between robots that follow."""
+        graphs = self.joint.robots
+        found = {hypothesis.id: hypothesis for hypothesis in sightings(self.store, graphs)}
+        consistency = judge(found.values(), graphs, self._evidence)
+        believed = [found[key] for key, j in consistency.judgements.items() if j.verdict is Verdict.ACCEPTED]
+        edges = fusing_edges(anchored(hypothesis, consistency.slack) for hypothesis in believed)
+        return consistency.judgements, [*edges, *bridges(consistency.offsets, edges)]
 
     def _versioned(self, edge: Edge | SightingEdge) -> Edge | SightingEdge:
         """The edge as a new version of the one that stands for it now, or that one if nothing has changed."""

@@ -27,8 +27,10 @@ class World:
         return UncertainPose(self.poses[a].between(self.poses[b]), self.covariance)
 
     def found(self, changed: set[int] | None = None, most: int = 99) -> list[tuple[int, int]]:
-        only = None if changed is None else {VertexId("red", i) for i in changed}
-        return [(c.a.index, c.b.index) for c in pairs(self.maps, self.poses, self.relative, only, most)]
+        def wanted(a: VertexId, b: VertexId) -> bool:
+            return changed is None or bool({a.index, b.index} & changed)
+
+        return [(c.a.index, c.b.index) for c in pairs(self.maps, self.poses, self.relative, wanted, most)]
 
 
 def test_neighbours_that_overlap_the_largest_overlap_first() -> None:
