@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pytest
 from rich.console import Console
 
+from factors import Edge
 from frontend import se2
 from mrtm.evaluation import (
     Evaluation,
@@ -277,6 +278,7 @@ def test_a_run_directory_is_evaluated(tmp_path: Path) -> None:
     fates = [fate for fate in sample_run().edges if fate.edge.kind == "loop" and fate.fate == "accepted"]
     poses = sample_run().vertex_poses
     edge = fates[0].edge
+    assert isinstance(edge, Edge)
     error = gtsam.Pose2.Logmap(poses[edge.tail].between(poses[edge.head]).between(edge.measurement))
     expected = error @ np.linalg.inv(edge.covariance) @ error / 3
     assert evaluation.edges["loop"].nees.mean == pytest.approx(expected, rel=1e-4)
