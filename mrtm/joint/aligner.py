@@ -4,7 +4,7 @@ An alignment is tried when two maps of a component may overlap. It is tried agai
 when the estimate has moved so far that the old answer was to another question.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import gtsam
@@ -54,9 +54,17 @@ class Aligner:
         self.attempts: dict[Pair, Attempt] = {}
         self._versions: dict[Pair, int] = {}
 
-    def edges(self, vertices: set[VertexId]) -> list[Edge]:
-        """Those believed between some vertices."""
-        return [a.edge for pair, a in self.attempts.items() if a.edge is not None and set(pair) <= vertices]
+    def edges(self) -> list[Edge]:
+        """Those believed."""
+        return [a.edge for a in self.attempts.values() if a.edge is not None]
+
+    def keep_within(self, groups: Iterable[Collection[str]]) -> None:
+        """Forget alignments between robots that are not, or no longer, in one of the ``groups``.
+
+        The guess was wrong then; if the robots come together again it is to another question.
+        """
+        group = {robot: number for number, robots in enumerate(groups) for robot in robots}
+        self.attempts = {p: a for p, a in self.attempts.items() if group[p[0].robot] == group[p[1].robot]}
 
     def joins(self, one: str, other: str) -> bool:
         """Whether an alignment between maps of two robots is believed."""
@@ -84,8 +92,9 @@ class Aligner:
     def take_back(self, graph: JointGraph) -> list[EdgeId]:
         """Give up alignments in ``graph`` that the joint estimate contradicts; their edges are to be removed."""
         gone = []
+        present = {edge.id for edge in graph.edges()}
         for pair, attempt in self.attempts.items():
-            if attempt.edge is None or attempt.edge.id not in {edge.id for edge in graph.edges()}:
+            if attempt.edge is None or attempt.edge.id not in present:
                 continue
             chi2 = graph.chi2(attempt.edge.id)
             if chi2 > CONTRADICTED:

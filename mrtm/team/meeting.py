@@ -73,7 +73,7 @@ def bridges(offsets: Mapping[tuple[str, str], UncertainPose], edges: Iterable[Gr
     direct = {frozenset((e.tail.robot, e.head.robot)) for e in edges if e.estimate is not None}
     return [
         Edge(
-            EdgeId(f"{a}-{b}", 0), 0, EdgeKind.FUSING,
+            EdgeId(f"{VertexId(a, 0)}-{VertexId(b, 0)}", 0), 0, EdgeKind.FUSING,
             VertexId(a, 0), VertexId(b, 0), offset.pose, WEAK * offset.covariance,
         )
         for (a, b), offset in offsets.items()

@@ -19,7 +19,7 @@ from mrtm.team.member import MemberRun
 from mrtm.team.records import Record, SightingRecord
 from mrtm.team.session_file import TimedSighting
 from mrtm.team.store import item_of
-from mrtm.team.teammate import ROUNDS, Teammate
+from mrtm.team.teammate import Peers, Teammate
 from mrtm.timing import Stages
 
 LINGER = 0.5  # seconds that robots stay in contact after a sighting, so that they know where they were
@@ -51,8 +51,9 @@ class _Playback:
         self._runs = runs
         self._config = config
         self._stages = Stages()
-        self._team = {run.robot: Teammate(run.robot, config, self._stages) for run in runs}
-        self._listener = Teammate(None, config, self._stages)
+        peers = Peers()
+        self._team = {run.robot: Teammate(run.robot, config, self._stages, peers) for run in runs}
+        self._listener = Teammate(None, config, self._stages, peers)
         self._sightings = _numbered(sightings)
         self._meetings: list[Meeting] = []
         self._frames: list[tuple[float, frozenset[str]]] = []  # team time and robots of every new component
@@ -75,8 +76,7 @@ class _Playback:
         for _, record in told:
             self._write_down(record)
         for teammate in (*(self._team.values() if len(self._team) > 1 else ()), self._listener):
-            teammate.think()
-            teammate.align(ROUNDS)
+            teammate.settle()
 
     def _write_down(self, record: Record) -> None:
         with self._stages("exchange"):
@@ -101,9 +101,6 @@ class _Playback:
         """What is known at the end, in the joint maps of the listener."""
         joint = self._listener.joint
         components = joint.components()
-        with self._stages("joint map"):
-            for component in components:
-                component.graph.optimize_fully()
         poses = {v: pose for c in components for v, pose in c.graph.estimates().items()}
         edges = [fate for run in self._runs for fate in run.past]
         edges += [EdgeFate(e, "accepted", chi2=c.graph.chi2(e.id)) for c in components for e in c.graph.edges()]

@@ -14,16 +14,28 @@ from mrtm.joint.hypotheses import HypothesisId
 from mrtm.joint.joint_map import Component, JointMap
 from mrtm.team.evidence import Evidence
 from mrtm.team.meeting import anchored, bridges, fusing_edges, sightings
-from mrtm.team.records import AnchorRecord, EdgeRecord, Key, SightingRecord, VertexRecord
+from mrtm.team.records import EdgeRecord, Key, SightingRecord, VertexRecord
 from mrtm.team.store import R, Store
 from mrtm.team.surfaces import Surfaces
 from mrtm.timing import Stages
 
 _Conclusion = tuple[Mapping[HypothesisId, Judgement], list[Edge | SightingEdge]]
 
-# Robots that are played in one process share what they conclude from the same records; the key is the store's hash.
-_concluded: dict[bytes, _Conclusion] = {}
-KEPT = 8
+KEPT = 8  # conclusions
+
+
+class Peers:
+    """What robots that are played together share, as long as they hold the same records: they need not all work it out.
+
+    Attributes:
+        concluded: what sightings come to, by the hash of the store.
+        settled: what all comes to, likewise.
+    """
+
+    def __init__(self) -> None:
+        self.concluded: dict[bytes, _Conclusion] = {}
+        self.settled: dict[bytes, Teammate] = {}
+
 
 ROUNDS = 10  # of alignments until the estimate has come to rest, at most
 
@@ -31,10 +43,15 @@ ROUNDS = 10  # of alignments until the estimate has come to rest, at most
 class Teammate:
     """What one robot knows, and what it makes of it: everything it concludes follows from the records it holds.
 
+    On the way it keeps what it has concluded, and so what it makes of the same records depends, within the noise, on
+    the order in which they came. ``settle`` ends that.
+
     Args:
         name: the robot; None for somebody who only listens.
         config: of the run.
         stages: counts the time of every stage.
+        peers: those it is played with.
+        store: what it knows already.
 
     Attributes:
         store: the records.
@@ -43,18 +60,22 @@ class Teammate:
         aligner: the alignments of maps, likewise.
     """
 
-    def __init__(self, name: str | None, config: Config, stages: Stages) -> None:
+    def __init__(
+        self, name: str | None, config: Config, stages: Stages, peers: Peers, store: Store | None = None
+    ) -> None:
         self.name = name
-        self.store = Store()
-        self.joint = JointMap(name)
+        self.store = Store() if store is None else store
+        self.joint = JointMap()
         self.judgements: Mapping[HypothesisId, Judgement] = {}
         self.aligner = Aligner()
         self._config = config
         self._stages = stages
+        self._peers = peers
         self._maps = Surfaces(self.store)
         self._evidence = Evidence(self._maps, self.joint, self.aligner)
         self._fusing: dict[EdgeId, Edge | SightingEdge] = {}
         self._told: dict[Key, int] = {}  # version of each record that the joint map knows
+        self._held = b""  # the hash of what was known when sightings were last judged
 
     def judgements_between(self, robots: tuple[str, str]) -> dict[HypothesisId, Judgement]:
         """The judgements of sightings between two robots."""
@@ -68,8 +89,25 @@ class Teammate:
         edges = [record.edge for record in self._news(EdgeRecord)]
         with self._stages("joint map"):
             self.joint.learn(edges, robots)
-        if [*self._news(AnchorRecord), *self._news(SightingRecord)]:
+        if self.store.summary() != self._held:
             self._fuse()
+
+    def settle(self) -> None:
+        """``think`` and ``align`` anew, from the records alone; with this the robot is at its end.
+
+        Whoever holds the same records comes to the same, which they share.
+        """
+        held = self.store.summary()
+        if held not in self._peers.settled:
+            fresh = Teammate(None, self._config, self._stages, Peers(), self.store)
+            fresh.think()
+            fresh.align(ROUNDS)
+            with self._stages("joint map"):
+                for component in fresh.joint.components():
+                    component.graph.optimize_fully()
+            self._peers.settled[held] = fresh
+        settled = self._peers.settled[held]
+        self.joint, self.judgements, self.aligner = settled.joint, settled.judgements, settled.aligner
 
     def align(self, rounds: int = 1) -> None:
         """M13, on line: align the maps of the components that are due, in so many rounds at most."""
@@ -77,11 +115,12 @@ class Teammate:
         for _ in range(rounds if most else 0):
             with self._stages("alignment"):
                 tried = [self.aligner.look(c.graph, self._maps, most) for c in self._components()]
-            if not any(tried):
-                return
-            self._enter()
+            if any(tried):
+                self._enter()
             if [edge for c in self._components() for edge in self.aligner.take_back(c.graph)]:
                 self._enter()
+            if not any(tried):
+                return
 
     def _components(self) -> list[Component]:
         """Those to care for: the robot's own, or all."""
@@ -98,11 +137,13 @@ class Teammate:
         """M11: judge all sightings anew, and let the accepted ones be the fusing edges."""
         with self._stages("judging"):
             held = self.store.summary()
-            if held not in _concluded:
-                _concluded[held] = self._conclude()
-                while len(_concluded) > KEPT:
-                    del _concluded[next(iter(_concluded))]
-            self.judgements, edges = _concluded[held]
+            concluded = self._peers.concluded
+            if held not in concluded:
+                concluded[held] = self._conclude()
+                while len(concluded) > KEPT:
+                    del concluded[next(iter(concluded))]
+            self.judgements, edges = concluded[held]
+        self._held = held
         self._fusing = {edge.id: self._versioned(edge) for edge in edges}
         self._enter()
 
@@ -125,10 +166,9 @@ class Teammate:
     def _enter(self) -> None:
         """Let the fusing edges, and the alignments within what they join, be what the joint map holds."""
         together = self.joint.connected(self._fusing.values())
-        vertices = [{v for robot in robots for v in self.joint.robots[robot].vertices()} for robots in together]
-        aligned = [edge for group in vertices for edge in self.aligner.edges(group)]
+        self.aligner.keep_within(together)
         with self._stages("joint map"):
-            self.joint.join([*self._fusing.values(), *aligned])
+            self.joint.join([*self._fusing.values(), *self.aligner.edges()])
 
 
 def _same(a: GraphEdge, b: GraphEdge) -> bool:
