@@ -19,8 +19,8 @@ FloatArray = npt.NDArray[np.float64]
 # Standard deviations outside 0.1 um .. 100 km, or a condition beyond what doubles can solve, are mistakes.
 _MIN_VARIANCE, _MAX_VARIANCE, _MAX_CONDITION = 1e-14, 1e10, 1e14
 
-# chi2 of 3 degrees of freedom, 95 %: up to here an honest edge keeps its full weight.
-_DCS_THRESHOLD = 7.815
+# chi2 of so many degrees of freedom, 95 %: up to here an edge under the robust kernel keeps its full weight.
+FULL_WEIGHT = {2: 5.991, 3: 7.815}
 
 
 class UncertainPose(NamedTuple):
@@ -38,16 +38,16 @@ def check_pose(pose: gtsam.Pose2, what: str) -> gtsam.Pose2:
     return pose
 
 
-def check_covariance(covariance: npt.ArrayLike, what: str) -> FloatArray:
-    """Return a read-only, exactly symmetric copy of a (3, 3) covariance.
+def check_covariance(covariance: npt.ArrayLike, what: str, size: int = 3) -> FloatArray:
+    """Return a read-only, exactly symmetric copy of a (3, 3) covariance, or of another size.
 
     Raises:
         FactorError: naming ``what``, if it has another shape, is not finite, symmetric and positive definite,
             or lies outside what double precision can solve.
     """
     matrix = np.array(covariance, dtype=np.float64)
-    if matrix.shape != (3, 3):
-        raise FactorError(f"{what}: covariance has shape {matrix.shape}, expected (3, 3)")
+    if matrix.shape != (size, size):
+        raise FactorError(f"{what}: covariance has shape {matrix.shape}, expected ({size}, {size})")
     if not np.all(np.isfinite(matrix)):
         raise FactorError(f"{what}: covariance is not finite: {matrix.tolist()}")
     if not np.allclose(matrix, matrix.T, rtol=1e-8, atol=1e-8 * np.abs(np.diag(matrix)).max()):
@@ -64,6 +64,23 @@ def check_covariance(covariance: npt.ArrayLike, what: str) -> FloatArray:
         )
     matrix.setflags(write=False)
     return matrix
+
+
+def check_pose_covariance(estimate: UncertainPose, what: str) -> UncertainPose:
+    """``estimate``, checked; its covariance may be zero or singular, as that of few particles is.
+
+    The covariance comes back read-only and positive definite: wider by 1e-12 of itself, at least by (0.3 um)^2.
+
+    Raises:
+        FactorError: naming ``what``, if the pose is not finite or the covariance fails ``check_covariance`` in
+            another way than by being singular.
+    """
+    check_pose(estimate.pose, what)
+    given = np.asarray(estimate.covariance, dtype=np.float64)
+    # A hair wider, it is positive definite if it was semidefinite: one set of rules for both.
+    hair = max(1e-12 * float(np.abs(np.nan_to_num(given)).max(initial=0.0)), 10.0 * _MIN_VARIANCE)
+    wider = given + hair * np.eye(3) if given.shape == (3, 3) else given
+    return UncertainPose(estimate.pose, check_covariance(wider, what))
 
 
 def adjoint_transport(a_T_b: gtsam.Pose2, covariance: FloatArray) -> FloatArray:
@@ -90,18 +107,18 @@ def robust(model: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
     (Cauchy and Geman-McClure always shave weight); beyond, its pull falls with the third power of the
     residual, so a false edge does not bend a map (Cauchy: the first power, metres of bend on a loose chain).
     """
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.DCS.Create(_DCS_THRESHOLD), model)
+    kernel = gtsam.noiseModel.mEstimator.DCS.Create(FULL_WEIGHT[model.dim()])
+    return gtsam.noiseModel.Robust.Create(kernel, model)
 
 
-def has_kernel(factor: gtsam.BetweenFactorPose2) -> bool:
+def has_kernel(factor: gtsam.NoiseModelFactor) -> bool:
     """Whether the factor is under a robust kernel."""
     return isinstance(factor.noiseModel(), gtsam.noiseModel.Robust)
 
 
-def without_kernel(factor: gtsam.BetweenFactorPose2) -> gtsam.BetweenFactorPose2:
+def without_kernel(factor: gtsam.NoiseModelFactor) -> gtsam.NoiseModelFactor:
     """The same factor with its Gaussian noise alone."""
     noise = factor.noiseModel()
     if not isinstance(noise, gtsam.noiseModel.Robust):
         return factor
-    tail, head = factor.keys()
-    return gtsam.BetweenFactorPose2(tail, head, factor.measured(), noise.noise())
+    return factor.cloneWithNewNoiseModel(noise.noise())

@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -43,24 +43,24 @@ def _main(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 @app.command()
 def run(
-    log: Annotated[Path, typer.Argument(help="A robot's log; the format is found by its content.")],
-    out: Annotated[Path, typer.Option(help="Directory for map, trajectory and graph.")],
+    session: Annotated[Path, typer.Argument(help="A team's YAML, or one robot's log of any known format.")],
+    out: Annotated[Path, typer.Option(help="Directory for map, trajectories and graph.")],
     config: ConfigFile = None,
     options: Options = None,
     preset: Preset = None,
     seed: Annotated[int | None, typer.Option(help="Seed of all random numbers; as --set seed=N.")] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="Threads; all cores if not given.")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, help="Cores to use; all if not given.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
 ) -> None:
-    """Map a building from a log."""
+    """Map a building with a team of robots, or from one robot's log."""
     parameters = _load(config, preset, [*(options or ()), *([] if seed is None else [f"seed={seed}"])])
     if threads is not None:
         os.environ["NUMBA_NUM_THREADS"] = str(threads)  # numba reads it when it is imported, below
     from mrtm.progress import showing
-    from mrtm.session import run_log
+    from mrtm.session import run_session
 
     with showing(quiet) as progress:
-        result = run_log(log, out, parameters, progress)
+        result = run_session(session, out, parameters, progress, threads)
     if not quiet:
         from mrtm.output.report import run_report
 
@@ -72,14 +72,24 @@ def evaluate(
     out: Annotated[Path, typer.Argument(help="What `mrtm run` left behind.")],
     relations: Annotated[Path | None, typer.Option(metavar="FILE", help="True relative poses.")] = None,
     truth: Annotated[Path | None, typer.Option(metavar="TUM", help="True or reference trajectory.")] = None,
+    session: Annotated[
+        Path | None, typer.Option(metavar="YAML", help="A team's session: its relations and truth, where not given.")
+    ] = None,
 ) -> None:
     """Measure a run against the truth."""
-    if relations is None and truth is None:
-        raise typer.BadParameter("give --relations FILE, --truth TUM, or both")
+    references: Mapping[str, Path] | Path | None = truth
+    if session is not None:
+        from mrtm.team.session_file import read_session
+
+        team = read_session(session)
+        relations, references = relations or team.relations, truth or team.truth
+    if not (relations or references):
+        given = "give" if session is None else f"{session} names neither relations nor truth; give"
+        raise typer.BadParameter(f"{given} --relations FILE, --truth TUM, or a --session YAML that names them")
     from mrtm.evaluation import evaluate_output
     from mrtm.output.report import evaluation_report
 
-    _print(evaluation_report(evaluate_output(out, relations, truth)))
+    _print(evaluation_report(evaluate_output(out, relations, references)))
 
 
 @app.command()

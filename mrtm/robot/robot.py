@@ -7,7 +7,7 @@ import numpy as np
 
 from factors import Edge, EdgeKind, UncertainPose, VertexId, compose, intersect, inverse
 from frontend import se2
-from frontend.local_slam import LocalSlam
+from frontend.local_slam import LocalSlam, Visit
 from frontend.points import Points, points_of
 from frontend.records import FloatArray, LaserScan
 from frontend.relocalisation import hypotheses
@@ -15,7 +15,7 @@ from mrtm.config import Config
 from mrtm.result import Event
 from mrtm.robot.poses import array_of, innovation, pose_of
 from mrtm.robot.reentry import Candidate, Trial, candidates
-from mrtm.robot.topology import Topology
+from mrtm.robot.topology import Topology, Vertex
 from mrtm.timing import Stages
 
 
@@ -37,6 +37,7 @@ class Robot:
         config: of the run.
         make_joint: given the first vertex (M1), the joint map to work with.
         notify: told of every event.
+        visited: told whenever a vertex's map has been closed: vertex, index of the visit's first scan, visit.
         stages: counts the time of every stage.
     """
 
@@ -46,6 +47,7 @@ class Robot:
         config: Config,
         make_joint: Callable[[VertexId], Joint],
         notify: Callable[[Event], None],
+        visited: Callable[[Vertex, int, Visit], None],
         stages: Stages,
     ) -> None:
         self.name = name
@@ -53,6 +55,7 @@ class Robot:
         self.topology = Topology(name)
         self.times: list[float] = []
         self._notify = notify
+        self._visited = visited
         self._stages = stages
         self._slam = LocalSlam(config.frontend, config.seed)
         self._half_width = 0.5 * config.frontend.travel_square
@@ -76,6 +79,16 @@ class Robot:
             self._slam.begin(points, self._at_origin())
         else:
             self._advance(points, increment)
+
+    def whereabouts(self, scan: int) -> tuple[VertexId, UncertainPose] | None:
+        """The vertex and the pose in it, ``local_T_robot``, at a scan of the present visit, as far as is known now.
+
+        None for a scan of an earlier visit, and while a re-entry is on trial.
+        """
+        if self._trial is not None or not self._first <= scan <= self._scan:
+            return None
+        pose = self._slam.path()[scan - self._first]
+        return self._here.id, UncertainPose(pose_of(pose), self._slam.covariance())
 
     def finish(self) -> None:
         """M12: the log is at its end; close the vertex the robot is in."""
@@ -112,6 +125,7 @@ class Robot:
         here.poses.extend(visit.poses)
         self._tell("left vertex", vertex=str(here.id), scans=len(visit.poses), since_resampling=visit.since_resampling)
         self._update_edge(UncertainPose(pose_of(visit.poses[0]), visit.covariance))
+        self._visited(here, self._first, visit)
         return UncertainPose(pose_of(visit.poses[-1]), visit.covariance)
 
     def _update_edge(self, entered: UncertainPose) -> None:

@@ -1,5 +1,6 @@
 """The command line as a user meets it: a process, its output and its exit code."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 
 import mrtm
 from mrtm.config import load_config
+from tools.fuzzing.seeds import RUNS, TRAJECTORIES
 
 HEAVY = ("numpy", "scipy", "numba", "gtsam", "matplotlib", "pydantic.main", "yaml")
 
@@ -54,6 +56,7 @@ def test_config_prints_what_config_reads(tmp_path: Path) -> None:
         (("run", "missing.clf", "--out", "OUT", "--seed", "-1"), "seed is -1: must be at least 0"),
         (("run", "EMPTY", "--out", "OUT", "--quiet"), "is empty"),
         (("evaluate", "OUT", "--relations", "missing.relations"), "OUT"),
+        (("evaluate", "OUT", "--session", "missing.yaml"), "missing.yaml: cannot be read"),
     ],
 )
 def test_a_user_error_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
@@ -65,6 +68,29 @@ def test_a_user_error_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tup
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("error: ")
     assert said in done.stderr
+
+
+def test_a_session_names_what_to_measure_against(tmp_path: Path) -> None:
+    (tmp_path / "trajectory").mkdir()
+    (tmp_path / "trajectory" / "robot.tum").write_bytes(TRAJECTORIES[0])
+    (tmp_path / "run.json").write_bytes(RUNS[0])
+    (tmp_path / "true.tum").write_bytes(TRAJECTORIES[0])
+    (tmp_path / "true.relations").write_text("3.5 5.5 -2 0 0 0 0 0\n")
+    session = tmp_path / "team.yaml"
+    team = "robots: {robot: {log: elsewhere.clf}}\n"  # the log is not needed
+    session.write_text(f"{team}relations: true.relations\ntruth: {{robot: true.tum}}\n")
+    done = call("evaluate", tmp_path, "--session", session)
+    assert (done.returncode, done.stderr) == (0, "")
+    measured = json.loads((tmp_path / "evaluation.json").read_text())
+    assert measured["relations"]["count"] == 1
+    assert measured["ate"][0]["count"] == 20
+    done = call("evaluate", tmp_path, "--session", session, "--relations", tmp_path / "mine.relations")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "mine.relations: cannot be read" in done.stderr
+    session.write_text(team)
+    done = call("evaluate", tmp_path, "--session", session)
+    assert done.returncode == 2
+    assert "names neither" in done.stderr
 
 
 def test_a_wrong_use_is_exit_code_2() -> None:

@@ -397,7 +397,7 @@ def test_the_command_writes_table_and_picture(tmp_path: Path) -> None:
     (table,) = tmp_path.glob("*-benchmark.md")
     assert table.with_suffix(".png").exists()
     assert "seed = 3 (default 0)" in table.read_text()
-    assert "## demo: 1443 scans" in table.read_text()
+    assert "## demo: 751 scans" in table.read_text()
 
 
 @pytest.mark.parametrize(
