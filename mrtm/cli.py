@@ -32,6 +32,10 @@ Options = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="One parameter, e.g. frontend.particles=60. Repeatable."),
 ]
 Preset = Annotated[str | None, typer.Option(metavar="NAME", help='"paper": the values of the paper.')]
+Session = Annotated[Path, typer.Argument(help="A team's YAML, or one robot's log of any known format.")]
+Seed = Annotated[int | None, typer.Option(help="Seed of all random numbers; as --set seed=N.")]
+Threads = Annotated[int | None, typer.Option(min=1, help="Cores to use; all if not given.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 
 
 @app.callback(invoke_without_command=True)
@@ -43,19 +47,17 @@ def _main(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 @app.command()
 def run(
-    session: Annotated[Path, typer.Argument(help="A team's YAML, or one robot's log of any known format.")],
+    session: Session,
     out: Annotated[Path, typer.Option(help="Directory for map, trajectories and graph.")],
     config: ConfigFile = None,
     options: Options = None,
     preset: Preset = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers; as --set seed=N.")] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="Cores to use; all if not given.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+    seed: Seed = None,
+    threads: Threads = None,
+    quiet: Quiet = False,
 ) -> None:
     """Map a building with a team of robots, or from one robot's log."""
-    parameters = _load(config, preset, [*(options or ()), *([] if seed is None else [f"seed={seed}"])])
-    if threads is not None:
-        os.environ["NUMBA_NUM_THREADS"] = str(threads)  # numba reads it when it is imported, below
+    parameters = _parameters(config, preset, options, seed, threads)
     from mrtm.progress import showing
     from mrtm.session import run_session
 
@@ -65,6 +67,30 @@ def run(
         from mrtm.output.report import run_report
 
         _print([*run_report(result), f"the map is {out / 'map.png'}, everything else in {out}"])
+
+
+@app.command()
+def compare(
+    session: Session,
+    out: Annotated[Path, typer.Option(help="Directory for the table and the figures.")],
+    config: ConfigFile = None,
+    options: Options = None,
+    preset: Preset = None,
+    seed: Seed = None,
+    threads: Threads = None,
+    quiet: Quiet = False,
+) -> None:
+    """Make the joint map three ways: before optimisation, by the paper's off-line EM, and on line."""
+    parameters = _parameters(config, preset, options, seed, threads)
+    from mrtm.progress import showing
+    from mrtm.session import compare_session
+
+    with showing(quiet) as progress:
+        scores = compare_session(session, out, parameters, progress, threads)
+    if not quiet:
+        from mrtm.compare import rows, table
+
+        _print([table(rows(scores)), f"the table and the paper's figures are in {out}"])
 
 
 @app.command()
@@ -157,6 +183,16 @@ def _print(parts: "Sequence[RenderableType]") -> None:
     console = Console(soft_wrap=True, highlight=False)
     for part in parts:
         console.print(part)
+
+
+def _parameters(
+    file: Path | None, preset: str | None, options: Sequence[str] | None, seed: int | None, threads: int | None
+) -> "Config":
+    """The parameters of a run, and the number of threads set, before anything imports numba."""
+    parameters = _load(file, preset, [*(options or ()), *([] if seed is None else [f"seed={seed}"])])
+    if threads is not None:
+        os.environ["NUMBA_NUM_THREADS"] = str(threads)  # numba reads it when it is imported
+    return parameters
 
 
 def _load(file: Path | None, preset: str | None, options: Sequence[str]) -> "Config":

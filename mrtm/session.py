@@ -1,4 +1,4 @@
-"""A run: a session in, joint map out."""
+"""What the commands do with a session: a run, or a comparison of ways to the joint map."""
 
 import os
 import time
@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from frontend.records import LaserScan
+from mrtm.compare import Score, compare
 from mrtm.config import Config
 from mrtm.output.export import export
 from mrtm.progress import Progress
@@ -13,9 +14,11 @@ from mrtm.result import RunResult
 from mrtm.team.front_ends import map_members
 from mrtm.team.member import map_member
 from mrtm.team.playback import play
-from mrtm.team.session_file import open_session
+from mrtm.team.session_file import TeamSession, open_session
 
-MAPPING, PLAYING = 0.85, 0.95  # of a run's time, when the front ends are done and when the team has been played
+FRONT_ENDS = 0.9  # of the time that mapping takes, before the team is played
+MAPPING = 0.95  # of a run's time
+COMPARED = 0.8  # of a comparison's time, when the session has been mapped
 
 
 def run_session(path: Path, out: Path, config: Config, progress: Progress, cores: int | None = None) -> RunResult:
@@ -28,21 +31,50 @@ def run_session(path: Path, out: Path, config: Config, progress: Progress, cores
         SessionError: the session is not one, or a robot's window of its log holds no scan.
         LogError: a log cannot be read or holds no usable scan.
     """
-    started = time.perf_counter()
+    result = map_session(open_session(path), config, lambda done, doing: progress(MAPPING * done, doing), cores)
+    progress(MAPPING, "writing")
+    export(result, out)
+    progress(1.0, f"{result.counts['scans']} scans, {result.counts['vertices']} vertices")
+    return result
+
+
+def compare_session(
+    path: Path, out: Path, config: Config, progress: Progress, cores: int | None = None
+) -> tuple[Score, ...]:
+    """Map a session and make its joint map three ways, measured against the truth that the session names.
+
+    Args:
+        out: for the table and the figures, see ``mrtm.compare.compare``.
+        cores: as of ``run_session``.
+
+    Raises:
+        SessionError, LogError: as of ``run_session``.
+        EvaluationError: a file of the truth cannot be read.
+    """
     session = open_session(path)
+    result = map_session(session, config, lambda done, doing: progress(COMPARED * done, doing), cores)
+    return compare(
+        result,
+        out,
+        session.relations,
+        session.truth,
+        lambda done, doing: progress(COMPARED + (1.0 - COMPARED) * done, doing),
+    )
+
+
+def map_session(session: TeamSession, config: Config, progress: Progress, cores: int | None = None) -> RunResult:
+    """Map a session; nothing is written. Arguments and errors as of ``run_session``."""
+    started = time.perf_counter()
     runs = map_members(
-        session, config, cores or os.cpu_count() or 1, lambda fraction, doing: progress(MAPPING * fraction, doing)
+        session, config, cores or os.cpu_count() or 1, lambda done, doing: progress(FRONT_ENDS * done, doing)
     )
     result = play(
         runs,
         session.sightings,
         config,
-        lambda fraction: progress(MAPPING + (PLAYING - MAPPING) * fraction, "meetings and joint map"),
+        lambda done: progress(FRONT_ENDS + (1.0 - FRONT_ENDS) * done, "meetings and joint map"),
     )
-    progress(PLAYING, "writing")
     result.timings["total"] = time.perf_counter() - started
-    export(result, out)
-    progress(1.0, f"{result.counts['scans']} scans, {result.counts['vertices']} vertices")
     return result
 
 

@@ -88,8 +88,8 @@ def rows(scores: tuple[Score, ...]) -> list[Row]:
     """The table of a comparison; what was not measured has no row."""
     table = [Row("", tuple(score.name for score in scores))]
     for name, errors in (
-        ("relations, all", [score.relations for score in scores]),
-        ("relations across robots", [score.relations_across for score in scores]),
+        ("relations", [score.relations for score in scores]),
+        ("across robots", [score.relations_across for score in scores]),
     ):
         measured = [e for e in errors if e is not None and e.count]
         if len(measured) == len(scores):
@@ -100,10 +100,10 @@ def rows(scores: tuple[Score, ...]) -> list[Row]:
     if all(score.ate is not None for score in scores):
         table.append(Row("ATE RMSE, m", tuple(f"{score.ate:.4f}" for score in scores)))
     table += [
-        Row("entropy where maps overlap, bits a cell", tuple(f"{s.crispness.entropy:.4f}" for s in scores)),
-        Row("of it disagreement between maps", tuple(f"{s.crispness.disagreement:.4f}" for s in scores)),
-        Row("optimisation, all robots, whole run, s", tuple(f"{s.seconds:.3f}" for s in scores)),
-        Row("longest single step, s", tuple(f"{s.longest:.4f}" for s in scores)),
+        Row("entropy of overlap, bits", tuple(f"{s.crispness.entropy:.4f}" for s in scores)),
+        Row("of it disagreement", tuple(f"{s.crispness.disagreement:.4f}" for s in scores)),
+        Row("optimisation, s", tuple(f"{s.seconds:.3f}" for s in scores)),
+        Row("longest step, s", tuple(f"{s.longest:.4f}" for s in scores)),
         Row("joint map available", tuple(s.available for s in scores)),
     ]
     return table

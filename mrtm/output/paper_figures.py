@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from scipy.ndimage import uniform_filter
 
-from factors import VertexId
+from factors import EdgeKind, VertexId
 from frontend.local_map import LocalMap
 from frontend.records import FloatArray
 from mrtm.joint.agreement import Lookup, overlap
@@ -192,13 +192,15 @@ def _most_overlapping(result: RunResult, component: list[VertexId]) -> tuple[Ver
 
 
 def _draw_graph(axes: Axes, result: RunResult, component: list[VertexId], view: View) -> None:
-    """Vertices as numbered discs, and edges, in the colour of the robot that made them."""
+    """Vertices as numbered discs, and edges, in the colour of the robot that made them; alignments, so many, thin."""
     colours = robot_colours(list(result.trajectories))
     places = dict(zip(component, view.turn(_positions(result, component)), strict=True))
     edges = [f.edge for f in result.edges if f.fate == "accepted" and f.edge.tail in places and f.edge.head in places]
+    edges.sort(key=lambda edge: edge.kind is not EdgeKind.ALIGNMENT)
     lines = [(places[e.tail], places[e.head]) for e in edges]
     shades = [colours[e.tail.robot] if e.tail.robot == e.head.robot else INK for e in edges]
-    for width, shade, order in ((3.6, ["#ffffff"] * len(lines), 3.0), (1.6, shades, 3.1)):
+    wide = np.array([0.6 if e.kind is EdgeKind.ALIGNMENT else 1.8 for e in edges])
+    for width, shade, order in ((2.0 * wide, ["#ffffff"] * len(lines), 3.0), (wide, shades, 3.1)):
         axes.add_collection(LineCollection(lines, colors=shade, linewidths=width, zorder=order), autolim=False)
     size = 11.0 if len(component) < 40 else 7.0
     faces = [colours[v.robot] for v in component]

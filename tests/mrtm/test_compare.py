@@ -130,7 +130,9 @@ def test_what_was_not_measured_has_no_row() -> None:
 
 
 def test_alignments_are_not_for_the_tree(result: RunResult, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mrtm.compare.ways.PAPER_EDGES", frozenset({"inter_vertex", "covariance_intersection"}))
+    monkeypatch.setattr(
+        "mrtm.compare.ways.PAPER_EDGES", frozenset({EdgeKind.INTER_VERTEX, EdgeKind.COVARIANCE_INTERSECTION})
+    )
     # The fusing edge is no longer one of the paper's: its transformation is lent from the joint estimate.
     tree, _, _ = three_ways(result, lambda fraction, doing: None)
     off = [distance(result.vertex_poses[v], tree.result.vertex_poses[v])[0] for v in (TEAM[1], TEAM[3])]
