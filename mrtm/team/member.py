@@ -87,6 +87,7 @@ def map_member(
         story.end_scan(robot)
         if len(robot.times) % 100 == 0:
             report(len(robot.times), len(robot.topology.vertices))
+    story.end_log()
     robot.finish()
     return _run(robot, story, stages)
 
@@ -150,6 +151,12 @@ class _Story:
             if (where := robot.whereabouts(anchor.scan)) is not None:
                 self._tell_anchor(anchor, *where)
 
+    def end_log(self) -> None:
+        """There is no scan any more; was there a moment at that of the last?"""
+        for number, moment in self._moments[:1]:
+            if self.times and moment == self.now:
+                self._anchors.append(_Anchor(number, len(self.times) - 1, np.zeros(3)))
+
     def visited(self, vertex: Vertex, first: int, visit: Visit) -> None:
         """A map has been closed: its scans' poses are what they will stay."""
         version = self._versions[vertex.id] = self._versions.get(vertex.id, 0) + 1
@@ -158,6 +165,7 @@ class _Story:
         self.records.append(MapRecord(vertex.id, version, self.now, local_map.grid, local_map.cloud, local_map.normals))
         for anchor in self._anchors:
             if first <= anchor.scan < first + len(visit.poses):
+                anchor.version = max(anchor.version, 0)  # what comes is refined, even if nothing was told before
                 pose = UncertainPose(pose_of(visit.poses[anchor.scan - first]), visit.covariance)
                 self._tell_anchor(anchor, vertex.id, pose)
 

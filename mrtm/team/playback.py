@@ -39,7 +39,7 @@ def play(
     Args:
         runs: of the front ends, one a robot.
         sightings: between them, by team time.
-        report: told now and then which fraction of the clock has passed.
+        report: told now and then which fraction of the meetings has passed.
     """
     playback = _Playback(runs, sightings, config)
     playback.play(report)
@@ -59,7 +59,6 @@ class _Playback:
         self._frames: list[tuple[float, frozenset[str]]] = []  # team time and robots of every new component
 
     def play(self, report: Callable[[float], None]) -> None:
-        end = max([r.records[-1].time for r in self._runs if r.records] + [s.time for s in self._sightings])
         meetings = _meetings(self._sightings, self._config.team.exchange_interval)
         told = deque[tuple[float, Record]](
             heapq.merge(
@@ -68,11 +67,11 @@ class _Playback:
                 key=lambda item: item[0],
             )
         )
-        for time, robots in meetings:
+        for number, (time, robots) in enumerate(meetings):
             while told and told[0][0] <= time:
                 self._write_down(told.popleft()[1])
             self._meet(time, robots)
-            report(time / end)
+            report(number / len(meetings))
         for _, record in told:
             self._write_down(record)
         for teammate in (*(self._team.values() if len(self._team) > 1 else ()), self._listener):
@@ -92,8 +91,8 @@ class _Playback:
         for teammate in (one, other):
             teammate.think()
             teammate.align()
-            robots_in = frozenset(teammate.joint.component(robots[0]).robots)
-            self._frames.append((time, robots_in))
+            if teammate.name in teammate.joint.robots:  # else it has not taken a scan yet
+                self._frames.append((time, frozenset(teammate.joint.component(teammate.name).robots)))
         verdict, reason = _verdict(one, robots)
         self._meetings.append(Meeting(time, robots, dict(traffic.sent), verdict, reason))
 
@@ -123,7 +122,8 @@ class _Playback:
                 "vertices": len(poses),
                 "edges": sum(len(c.graph.edges()) for c in components),
             },
-            blemishes=list(dict.fromkeys(blemish for run in self._runs for blemish in run.blemishes)),
+            blemishes=list(dict.fromkeys(blemish for run in self._runs for blemish in run.blemishes))
+            + list(joint.refused.values()),
             team=self._story() if len(self._runs) > 1 else None,
         )
 
