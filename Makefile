@@ -8,8 +8,8 @@ OUT := out/demo
 .PHONY: demo test quick lint bench fuzz clean
 
 demo: $(STAMP)
-	$(BIN)/mrtm run $(DEMO)/demo.clf.gz --out $(OUT)
-	$(BIN)/mrtm evaluate $(OUT) --truth $(DEMO)/truth.tum
+	$(BIN)/mrtm run $(DEMO)/team.yaml --out $(OUT)
+	$(BIN)/mrtm evaluate $(OUT) --session $(DEMO)/team.yaml
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -n auto

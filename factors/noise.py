@@ -1,4 +1,4 @@
-"""Covariances of poses on SE(2): checks, changes of frame, particle sets, the robust kernel.
+"""Covariances of poses on SE(2): checks, changes of frame, the robust kernel.
 
 Convention (the whole project): a covariance is 3x3, order x, y, theta, in the tangent space at the measured
 pose, in the frame of the child: ``a_T_b_true = a_T_b * Exp(xi)``, ``xi ~ N(0, covariance)``. This is what
@@ -19,8 +19,8 @@ FloatArray = npt.NDArray[np.float64]
 # Standard deviations outside 0.1 um .. 100 km, or a condition beyond what doubles can solve, are mistakes.
 _MIN_VARIANCE, _MAX_VARIANCE, _MAX_CONDITION = 1e-14, 1e10, 1e14
 
-# chi2 of 3 degrees of freedom, 95 %: up to here an honest edge keeps its full weight.
-_DCS_THRESHOLD = 7.815
+# chi2 of so many degrees of freedom, 95 %: up to here an edge under the robust kernel keeps its full weight.
+FULL_WEIGHT = {2: 5.991, 3: 7.815}
 
 
 class UncertainPose(NamedTuple):
@@ -38,16 +38,16 @@ def check_pose(pose: gtsam.Pose2, what: str) -> gtsam.Pose2:
     return pose
 
 
-def check_covariance(covariance: npt.ArrayLike, what: str) -> FloatArray:
-    """Return a read-only, exactly symmetric copy of a (3, 3) covariance.
+def check_covariance(covariance: npt.ArrayLike, what: str, size: int = 3) -> FloatArray:
+    """Return a read-only, exactly symmetric copy of a (3, 3) covariance, or of another size.
 
     Raises:
         FactorError: naming ``what``, if it has another shape, is not finite, symmetric and positive definite,
             or lies outside what double precision can solve.
     """
     matrix = np.array(covariance, dtype=np.float64)
-    if matrix.shape != (3, 3):
-        raise FactorError(f"{what}: covariance has shape {matrix.shape}, expected (3, 3)")
+    if matrix.shape != (size, size):
+        raise FactorError(f"{what}: covariance has shape {matrix.shape}, expected ({size}, {size})")
     if not np.all(np.isfinite(matrix)):
         raise FactorError(f"{what}: covariance is not finite: {matrix.tolist()}")
     if not np.allclose(matrix, matrix.T, rtol=1e-8, atol=1e-8 * np.abs(np.diag(matrix)).max()):
@@ -64,6 +64,23 @@ def check_covariance(covariance: npt.ArrayLike, what: str) -> FloatArray:
         )
     matrix.setflags(write=False)
     return matrix
+
+
+def check_pose_covariance(estimate: UncertainPose, what: str) -> UncertainPose:
+    """``estimate``, checked; its covariance may be zero or singular, as that of few particles is.
+
+    The covariance comes back read-only and positive definite: wider by 1e-12 of itself, at least by (0.3 um)^2.
+
+    Raises:
+        FactorError: naming ``what``, if the pose is not finite or the covariance fails ``check_covariance`` in
+            another way than by being singular.
+    """
+    check_pose(estimate.pose, what)
+    given = np.asarray(estimate.covariance, dtype=np.float64)
+    # A hair wider, it is positive definite if it was semidefinite: one set of rules for both.
+    hair = max(1e-12 * float(np.abs(np.nan_to_num(given)).max(initial=0.0)), 10.0 * _MIN_VARIANCE)
+    wider = given + hair * np.eye(3) if given.shape == (3, 3) else given
+    return UncertainPose(estimate.pose, check_covariance(wider, what))
 
 
 def adjoint_transport(a_T_b: gtsam.Pose2, covariance: FloatArray) -> FloatArray:
@@ -83,37 +100,6 @@ def compose(first: UncertainPose, second: UncertainPose) -> UncertainPose:
     return UncertainPose(first.pose.compose(second.pose), carried + second.covariance)
 
 
-def particle_estimate(particles: FloatArray, weights: FloatArray) -> UncertainPose:
-    """Mean and covariance of a weighted set of poses: the spread of ``Log(mean^-1 * particle)`` (M3).
-
-    The mean is the one on the group (zero mean logarithm), found by iteration from the heaviest particle.
-
-    Args:
-        particles: (N, 3) a_T_b, metres and radians, any branch of the angle.
-        weights: (N,) not negative, sum positive; normalised here.
-
-    Returns:
-        a_T_b and its covariance; that of fewer than four distinct particles is singular: no factor takes it.
-
-    Raises:
-        FactorError: if a particle is not finite or the weights are not usable.
-    """
-    if particles.ndim != 2 or particles.shape[1] != 3 or not np.all(np.isfinite(particles)):
-        raise FactorError(f"particles must be finite with shape (N, 3), got shape {particles.shape}")
-    total = float(np.sum(weights))
-    if weights.shape != particles.shape[:1] or not np.all(weights >= 0.0) or not 0.0 < total < np.inf:
-        raise FactorError(f"weights must be (N,), >= 0, with a positive sum: shape {weights.shape}, sum {total}")
-    shares = weights / total
-    mean = gtsam.Pose2(*particles[int(np.argmax(shares))])
-    for _ in range(50):
-        step = shares @ _logs(mean, particles)
-        mean = mean.compose(gtsam.Pose2.Expmap(step))
-        if float(np.abs(step).max()) < 1e-12:
-            break
-    logs = _logs(mean, particles)
-    return UncertainPose(mean, (shares[:, None] * logs).T @ logs)
-
-
 def robust(model: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
     """``model`` under dynamic covariance scaling (Agarwal et al. 2013), for edges that may be false.
 
@@ -121,30 +107,18 @@ def robust(model: gtsam.noiseModel.Base) -> gtsam.noiseModel.Robust:
     (Cauchy and Geman-McClure always shave weight); beyond, its pull falls with the third power of the
     residual, so a false edge does not bend a map (Cauchy: the first power, metres of bend on a loose chain).
     """
-    return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.DCS.Create(_DCS_THRESHOLD), model)
+    kernel = gtsam.noiseModel.mEstimator.DCS.Create(FULL_WEIGHT[model.dim()])
+    return gtsam.noiseModel.Robust.Create(kernel, model)
 
 
-def has_kernel(factor: gtsam.BetweenFactorPose2) -> bool:
+def has_kernel(factor: gtsam.NoiseModelFactor) -> bool:
     """Whether the factor is under a robust kernel."""
     return isinstance(factor.noiseModel(), gtsam.noiseModel.Robust)
 
 
-def without_kernel(factor: gtsam.BetweenFactorPose2) -> gtsam.BetweenFactorPose2:
+def without_kernel(factor: gtsam.NoiseModelFactor) -> gtsam.NoiseModelFactor:
     """The same factor with its Gaussian noise alone."""
     noise = factor.noiseModel()
     if not isinstance(noise, gtsam.noiseModel.Robust):
         return factor
-    tail, head = factor.keys()
-    return gtsam.BetweenFactorPose2(tail, head, factor.measured(), noise.noise())
-
-
-def _logs(mean: gtsam.Pose2, poses: FloatArray) -> FloatArray:
-    """(N, 3) Log(mean^-1 * pose), the closed form of gtsam.Pose2.Logmap for many poses at once."""
-    c, s = np.cos(mean.theta()), np.sin(mean.theta())
-    dx, dy = poses[:, 0] - mean.x(), poses[:, 1] - mean.y()
-    x, y = c * dx + s * dy, c * dy - s * dx
-    theta = np.remainder(poses[:, 2] - mean.theta() + np.pi, 2.0 * np.pi) - np.pi
-    half = 0.5 * theta
-    small = np.abs(half) < 1e-5
-    cot = np.where(small, 1.0 - half * half / 3.0, half / np.tan(np.where(small, 1.0, half)))
-    return np.stack([cot * x + half * y, cot * y - half * x, theta], axis=1)
+    return factor.cloneWithNewNoiseModel(noise.noise())

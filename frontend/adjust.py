@@ -19,7 +19,7 @@ import numpy.typing as npt
 from numba import njit
 
 from frontend import se2
-from frontend.grid import NX, NY, Maps, N, X, Y
+from frontend.grid import NX, NY, TILE, Maps, N, X, Y, at
 from frontend.matching import CORE, FACING, LAST_GATE
 from frontend.records import FloatArray
 
@@ -72,7 +72,7 @@ def _normals(index, surfels, count, resolution, out):  # type: ignore[no-untyped
     A surfel's own normal is off by a few hundredths of a radian: over a long wall that would add up to information on
     the place along it, of which there is none.
     """
-    rows, columns = index.shape
+    rows = columns = len(index) * TILE
     inv = 1.0 / resolution
     steps = int(WALL * inv)
     for k in range(1, count):
@@ -92,7 +92,7 @@ def _normals(index, surfels, count, resolution, out):  # type: ignore[no-untyped
             v = int((surfels[k, Y] + t * nx * resolution) * inv + 0.5 * rows)
             if u < 0 or v < 0 or u >= columns or v >= rows:
                 continue
-            j = index[v, u]
+            j = at(index, v, u)
             if j == 0 or j == last or surfels[j, N] <= 0.0:
                 continue
             last = j
@@ -125,7 +125,7 @@ def _normals(index, surfels, count, resolution, out):  # type: ignore[no-untyped
 def _observe(index, surfels, normals, resolution, hits, starts, ends, poses, sigma, scan, surfel, jacobian, error, weight):  # type: ignore[no-untyped-def]  # noqa: E501  # fmt: skip
     """The endpoints that lie on a line: scan, surfel, (3,) derivative of the distance by the pose, distance, robust
     weight in units of ``1 / sigma**2``. Returns how many."""
-    rows, columns = index.shape
+    rows = columns = len(index) * TILE
     inv = 1.0 / resolution
     core = 1.0 / (sigma * sigma * CORE * CORE)
     n = 0
@@ -140,7 +140,7 @@ def _observe(index, surfels, normals, resolution, hits, starts, ends, poses, sig
             v = int((ry + y) * inv + 0.5 * rows)
             if u < 0 or v < 0 or u >= columns or v >= rows:
                 continue
-            k = index[v, u]
+            k = at(index, v, u)
             if k <= 0 or surfels[k, N] <= 0.0:
                 continue
             dx = rx + x - surfels[k, X]

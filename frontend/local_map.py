@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from frontend.grid import NX, NY, UNIT, Maps, N, X, Y
 from frontend.records import FloatArray
 
 
@@ -42,3 +43,17 @@ class LocalMap:
     poses: FloatArray
     cloud: FloatArray
     normals: FloatArray
+
+
+def contents(maps: Maps) -> tuple[Grid, FloatArray, FloatArray]:
+    """Grid, cloud (m, 2) and normals (m, 2), as of ``LocalMap``, of the first map of a stack."""
+    log_odds, corner = maps.known(0)
+    surfels = maps.surfels[0, 1 : maps.counts[0]].astype(np.float64)
+    surfels = surfels[surfels[:, N] > 0]
+    normals = surfels[:, NX : NY + 1]
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    return (
+        Grid(log_odds.astype(np.float32) / UNIT, maps.resolution, corner),
+        surfels[:, X : Y + 1],
+        np.where(lengths > 0.5, normals / np.maximum(lengths, 0.5), 0.0),
+    )

@@ -9,9 +9,10 @@ from frontend import motion, se2
 from frontend.grid import Maps
 from frontend.parameters import FilterParameters
 from frontend.points import Points, merge
-from frontend.rbpf import REVERSED, ParticleFilter, Step
+from frontend.rbpf import ParticleFilter
 from frontend.records import FloatArray
 from frontend.refine import localise, refine
+from frontend.tracking import REVERSED, Step
 
 PATIENCE = 2.5  # times the usual distance between key scans
 SOFTNESS = 0.06  # difference of two scores that makes one hypothesis e times likelier than the other

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import njit
 
-from frontend.grid import NX, NY, N, X, Y
+from frontend.grid import NX, NY, TILE, N, X, Y, at
 
 MAX_ITERATIONS = 15
 FIRST_GATE = 0.30  # metres: how far from a surfel an endpoint may lie in the first iteration,
@@ -22,6 +22,8 @@ CORE = 2.0  # Geman-McClure: residuals beyond this many sigma lose their say
 STEP_XY = 2e-4  # metres and
 STEP_THETA = 5e-5  # radians: the iteration has converged
 FREE = -10  # log-odds (steps) below which a cell is known to be free
+
+GONE, SPOT, LINE = range(3)  # what a surfel is to the matcher
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -40,7 +42,7 @@ def match(log_odds, index, surfels, resolution, hits, start, prior, information,
         have a surfel; how many lie in free space instead; and the log-likelihood relative to that of a perfect fit.
         Endpoints in unknown space count for nothing.
     """
-    rows, columns = index.shape
+    columns = rows = len(index) * TILE
     inv = 1.0 / resolution
     half_u = 0.5 * columns
     half_v = 0.5 * rows
@@ -52,92 +54,111 @@ def match(log_odds, index, surfels, resolution, hits, start, prior, information,
     core = 1.0 / (CORE * CORE)
     gate = FIRST_GATE
     last = False
-    fit = 0.0
-    free = 0
-    near = 0
-    log_likelihood = 0.0
-    for iteration in range(MAX_ITERATIONS + 1):
+    # A pass has three loops, so that the first and the third, which are arithmetic only, become vector instructions.
+    n = len(hits)
+    hx = np.empty(n)
+    hy = np.empty(n)
+    for i in range(n):
+        hx[i] = hits[i, 0]
+        hy[i] = hits[i, 1]
+    rx = np.empty(n)
+    ry = np.empty(n)
+    us = np.empty(n, np.int32)
+    vs = np.empty(n, np.int32)
+    # The surfel that each endpoint met last: mostly it meets the same one in the next pass.
+    met = np.zeros(n, np.int64)
+    sx = np.empty(n)
+    sy = np.empty(n)
+    snx = np.empty(n)
+    sny = np.empty(n)
+    kind = np.empty(n, np.int8)
+    # Pairs of an endpoint and a line: distance, its gradient by x, y and theta; and the squared ones of all pairs.
+    e = np.empty(n)
+    j0 = np.empty(n)
+    j1 = np.empty(n)
+    j2 = np.empty(n)
+    squares = np.empty(n)
+    iteration = 0
+    while True:
+        final = last or iteration == MAX_ITERATIONS
         c = math.cos(theta)
         s = math.sin(theta)
+        for i in range(n):
+            rx[i] = c * hx[i] - s * hy[i]
+            ry[i] = s * hx[i] + c * hy[i]
+            us[i] = np.int32((rx[i] + x) * inv + half_u)
+            vs[i] = np.int32((ry[i] + y) * inv + half_v)
         a00 = a01 = a02 = a11 = a12 = a22 = 0.0
         b0 = b1 = b2 = 0.0
-        fit = 0.0
+        lines = 0
+        posts = 0
         free = 0
-        near = 0
-        log_likelihood = 0.0
         gate2 = gate * gate
-        for i in range(len(hits)):
-            rx = c * hits[i, 0] - s * hits[i, 1]
-            ry = s * hits[i, 0] + c * hits[i, 1]
-            px = rx + x
-            py = ry + y
-            u = int(px * inv + half_u)
-            v = int(py * inv + half_v)
+        for i in range(n):
+            u = us[i]
+            v = vs[i]
             if u < 0 or v < 0 or u >= columns or v >= rows:
                 continue
-            k = index[v, u]
-            found = False
-            m = 0.0
-            if k > 0 and surfels[k, N] > 0.0:
-                dx = px - surfels[k, X]
-                dy = py - surfels[k, Y]
-                d2 = dx * dx + dy * dy
-                if d2 < gate2:
+            k = at(index, v, u)
+            if k > 0:
+                if k != met[i]:
+                    met[i] = k
+                    sx[i] = surfels[k, X]
+                    sy[i] = surfels[k, Y]
                     nx = surfels[k, NX]
                     ny = surfels[k, NY]
                     length = math.sqrt(nx * nx + ny * ny)
-                    if length > COHERENCE:
-                        hx = c * hits[i, 2] - s * hits[i, 3]
-                        hy = s * hits[i, 2] + c * hits[i, 3]
-                        nx /= length
-                        ny /= length
-                        if (hx == 0.0 and hy == 0.0) or hx * nx + hy * ny > FACING:
-                            found = True
-                            e = nx * dx + ny * dy
-                            m = e * e * weight_line
-                            w = 1.0 / (1.0 + m * core)
-                            w = weight_line * w * w
-                            j2 = ny * rx - nx * ry
-                            a00 += w * nx * nx
-                            a01 += w * nx * ny
-                            a02 += w * nx * j2
-                            a11 += w * ny * ny
-                            a12 += w * ny * j2
-                            a22 += w * j2 * j2
-                            b0 += w * nx * e
-                            b1 += w * ny * e
-                            b2 += w * j2 * e
-                    else:
-                        found = True
+                    kind[i] = GONE if surfels[k, N] <= 0.0 else LINE if length > COHERENCE else SPOT
+                    if kind[i] == LINE:
+                        snx[i] = nx / length
+                        sny[i] = ny / length
+                dx = rx[i] + x - sx[i]
+                dy = ry[i] + y - sy[i]
+                d2 = dx * dx + dy * dy
+                if kind[i] != GONE and d2 < gate2:
+                    if kind[i] == SPOT:
                         m = d2 * weight_post
                         w = 1.0 / (1.0 + m * core)
                         w = weight_post * w * w
                         a00 += w
-                        a02 -= w * ry
+                        a02 -= w * ry[i]
                         a11 += w
-                        a12 += w * rx
-                        a22 += w * (rx * rx + ry * ry)
+                        a12 += w * rx[i]
+                        a22 += w * (rx[i] * rx[i] + ry[i] * ry[i])
                         b0 += w * dx
                         b1 += w * dy
-                        b2 += w * (rx * dy - ry * dx)
-            if found:
-                near += 1
-                g = 1.0 / (1.0 + 0.25 * m)
-                fit += g
-                log_likelihood -= 0.5 * m / (1.0 + m * core)
-            elif log_odds[v, u] < FREE:
+                        b2 += w * (rx[i] * dy - ry[i] * dx)
+                        posts += 1
+                        squares[n - posts] = m
+                        continue
+                    nx = snx[i]
+                    ny = sny[i]
+                    p = hits[i, 2]
+                    q = hits[i, 3]
+                    if (p == 0.0 and q == 0.0) or (c * p - s * q) * nx + (s * p + c * q) * ny > FACING:
+                        e[lines] = nx * dx + ny * dy
+                        j0[lines] = nx
+                        j1[lines] = ny
+                        j2[lines] = ny * rx[i] - nx * ry[i]
+                        lines += 1
+                        continue
+            if final and at(log_odds, v, u) < FREE:
                 free += 1
-                log_likelihood -= 0.5 / core
-        hessian[0, 0] = a00
-        hessian[0, 1] = a01
-        hessian[0, 2] = a02
-        hessian[1, 0] = a01
-        hessian[1, 1] = a11
-        hessian[1, 2] = a12
-        hessian[2, 0] = a02
-        hessian[2, 1] = a12
-        hessian[2, 2] = a22
-        if last or iteration == MAX_ITERATIONS:
+        for i in range(lines):
+            m = e[i] * e[i] * weight_line
+            squares[i] = m
+            w = 1.0 / (1.0 + m * core)
+            w = weight_line * w * w
+            a00 += w * j0[i] * j0[i]
+            a01 += w * j0[i] * j1[i]
+            a02 += w * j0[i] * j2[i]
+            a11 += w * j1[i] * j1[i]
+            a12 += w * j1[i] * j2[i]
+            a22 += w * j2[i] * j2[i]
+            b0 += w * j0[i] * e[i]
+            b1 += w * j1[i] * e[i]
+            b2 += w * j2[i] * e[i]
+        if final:
             break
         e0 = x - prior[0]
         e1 = y - prior[1]
@@ -159,8 +180,10 @@ def match(log_odds, index, surfels, resolution, hits, start, prior, information,
         c01 = a02 * a12 - a01 * a22
         c02 = a01 * a12 - a02 * a11
         det = a00 * c00 + a01 * c01 + a02 * c02
+        iteration += 1
         if det <= 0.0:
-            break
+            last = True
+            continue
         d0 = (c00 * b0 + c01 * b1 + c02 * b2) / det
         d1 = (c01 * b0 + (a00 * a22 - a02 * a02) * b1 + (a01 * a02 - a00 * a12) * b2) / det
         d2 = (c02 * b0 + (a01 * a02 - a00 * a12) * b1 + (a00 * a11 - a01 * a01) * b2) / det
@@ -173,7 +196,20 @@ def match(log_odds, index, surfels, resolution, hits, start, prior, information,
     start[0] = x
     start[1] = y
     start[2] = theta
-    return fit, near, free, log_likelihood
+    hessian[0, 0] = a00
+    hessian[0, 1] = hessian[1, 0] = a01
+    hessian[0, 2] = hessian[2, 0] = a02
+    hessian[1, 1] = a11
+    hessian[1, 2] = hessian[2, 1] = a12
+    hessian[2, 2] = a22
+    squares[lines : lines + posts] = squares[n - posts :]
+    fit = 0.0
+    log_likelihood = -0.5 / core * free
+    for i in range(lines + posts):
+        m = squares[i]
+        fit += 1.0 / (1.0 + 0.25 * m)
+        log_likelihood -= 0.5 * m / (1.0 + m * core)
+    return fit, lines + posts, free, log_likelihood
 
 
 @njit(cache=True, nogil=True)
@@ -200,7 +236,7 @@ def search(log_odds, index, surfels, resolution, hits, centre, reach_xy, step_xy
     Returns:
         number of peaks found.
     """
-    rows, columns = index.shape
+    columns = rows = len(index) * TILE
     inv = 1.0 / resolution
     half_u = 0.5 * columns
     half_v = 0.5 * rows
@@ -230,10 +266,10 @@ def search(log_odds, index, surfels, resolution, hits, centre, reach_xy, step_xy
                     u = int(rx[i] + ox)
                     v = int(ry[i] + oy)
                     if 0 <= u < columns and 0 <= v < rows:
-                        k = index[v, u]
+                        k = at(index, v, u)
                         if k > 0:
                             near += 1
-                        elif log_odds[v, u] < FREE:
+                        elif at(log_odds, v, u) < FREE:
                             free += 1
                 e0 = ix * step_xy
                 e1 = iy * step_xy

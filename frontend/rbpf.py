@@ -8,19 +8,19 @@ Random numbers are hashed from (seed, step, particle), so the result does not de
 """
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from frontend import motion, se2
+from frontend import se2
 from frontend.grid import Maps, insert
-from frontend.matching import match, search
+from frontend.matching import match
 from frontend.parameters import FilterParameters
 from frontend.points import Points
 from frontend.records import FloatArray
+from frontend.tracking import Step, Tracker
 
 
 @njit(cache=True, nogil=True)
@@ -59,7 +59,7 @@ def _draw(mean, covariance, seed, step, particle):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _propose(log_odds, index, surfels, resolution, hits, priors, variances, independence, sigma, seed, step, poses, log_weights, covariances, fits):  # type: ignore[no-untyped-def]  # noqa: E501  # fmt: skip
+def _propose(log_odds, index, surfels, resolution, hits, priors, variances, independence, sigma, seed, step, poses, log_weights, covariances):  # type: ignore[no-untyped-def]  # noqa: E501  # fmt: skip
     """Match, draw and weigh every particle; ``poses`` holds the starts and receives the draws."""
     for p in prange(len(poses)):
         theta = priors[p, 2]
@@ -71,7 +71,7 @@ def _propose(log_odds, index, surfels, resolution, hits, priors, variances, inde
         information[0, 1] = information[1, 0] = c * s * (1.0 / variances[0] - 1.0 / variances[1])
         information[2, 2] = 1.0 / variances[2]
         hessian = np.empty((3, 3))
-        fit, near, free, log_likelihood = match(
+        _, _, _, log_likelihood = match(
             log_odds[p], index[p], surfels[p], resolution, hits, poses[p], priors[p], information, sigma, hessian
         )
         e = poses[p] - priors[p]
@@ -89,40 +89,14 @@ def _propose(log_odds, index, surfels, resolution, hits, priors, variances, inde
         )
         _draw(poses[p], covariance, seed, step, p)
         covariances[p] = covariance
-        fits[p] = fit / max(1, near + free)
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _insert_all(log_odds, index, surfels, counts, bounds, resolution, poses, hits, clear, sensor):  # type: ignore[no-untyped-def]
+def _insert_all(log_odds, index, surfels, counts, touched, resolution, poses, hits, clear, sensor):  # type: ignore[no-untyped-def]
     for p in prange(len(poses)):
         counts[p] = insert(
-            log_odds[p], index[p], surfels[p], counts[p], bounds[p], resolution, poses[p], hits, clear, sensor
+            log_odds[p], index[p], surfels[p], counts[p], touched[p], resolution, poses[p], hits, clear, sensor
         )
-
-
-@dataclass(slots=True)
-class Step:
-    """Where the best particle is at one scan, and how sure of it.
-
-    Attributes:
-        pose: (3,) local_T_robot.
-        fit: fraction of the endpoints in known space that the map explains, 0 to 1.
-        known: fraction of all endpoints that lie in known space.
-        log_likelihood: of the scan, relative to that of a perfect fit.
-        hessian: (3, 3) information of the scan on the pose, map coordinates.
-        searched: 0 if the plain match was good; 1 or 2 for a search around or far around the expected pose.
-        reversed: odometry was found to have changed its sign,
-        forward: and whether it has the right one now.
-    """
-
-    pose: FloatArray
-    fit: float
-    known: float
-    log_likelihood: float
-    hessian: FloatArray
-    searched: int = 0
-    reversed: bool = False
-    forward: bool = True
 
 
 class ParticleFilter:
@@ -137,17 +111,10 @@ class ParticleFilter:
         self._steps = 0
         self._log_weights = np.zeros(p.particles)
         self._covariances = np.zeros((p.particles, 3, 3))
-        self._variances = np.zeros(3)
-        self._motion = np.zeros(3)
         self._history: list[tuple[FloatArray, npt.NDArray[np.int64]]] = []
         self.resampled = 0
         self.leader = 0
-        self.pose = np.zeros(3)
-        self.doubt = 0.0  # log-likelihood by which the opposite sign explains the last scans better
-        self._sign = np.ones(3)
-        self._unsure = 0.0  # metres driven under the opposite sign since a scan last spoke for it
-        self._mirror = np.zeros(3)
-        self._mirror_motion = np.zeros(3)
+        self._tracker = Tracker(parameters)
 
     def start(self, poses: FloatArray, known: Maps | None = None) -> None:
         """Begin a local map: M1 and M7a with ``poses`` all zero and nothing known; M3's re-entry with the poses drawn
@@ -167,8 +134,7 @@ class ParticleFilter:
         self._covariances[:] = 0.0
         self._history = [(self.poses.copy(), np.arange(count))]
         self.leader = 0
-        self.pose = self.poses[0].copy()
-        self._rest()
+        self._tracker.rest(self.poses[0].copy())
 
     @property
     def weights(self) -> FloatArray:
@@ -177,99 +143,13 @@ class ParticleFilter:
         return np.asarray(w / w.sum())
 
     def track(self, points: Points, increment: FloatArray) -> Step:
-        """Follow the best particle over one odometry ``increment`` (3,) by matching ``points`` to its map.
+        """Follow the best particle over one odometry ``increment`` (3,) by matching ``points`` to its map."""
+        return self._tracker.track(self.maps.layers(self.leader), points, increment)
 
-        Public logs have stretches of reverse driving recorded as forward, or the other way round. So a second track
-        runs along under the opposite sign; where it has explained the scans better for a while, it becomes the first.
-        """
-        increment = increment * self._sign
-        added = motion.variance(increment, self.parameters.motion)
-        self._variances += added
-        step, merit = self._follow(points, self.pose, increment, added)
-        self._motion = se2.compose(self._motion, increment)
-        turned_over = False
-        if abs(increment[0]) + abs(increment[1]) < STILL:
-            self._mirror = se2.compose(self._mirror, increment)
-            self._mirror_motion = se2.compose(self._mirror_motion, increment)
-        else:
-            mirrored, mirrored_merit = self._follow(points, self._mirror, increment * OPPOSITE, added)
-            self._mirror, self._mirror_motion = mirrored.pose, se2.compose(self._mirror_motion, increment * OPPOSITE)
-            # One scan proves little: its time may be off by a good part of the way driven. Nor does a bare corridor.
-            evidence = _grip(step, increment) * (mirrored_merit - merit)
-            self.doubt = max(0.0, self.doubt + min(evidence, REVERSED / REVERSED_SCANS))
-            # A wrong sign is the exception: it is held only as long as the scans go on saying so.
-            held = self._sign[0] < 0.0 and evidence > -1.0
-            self._unsure = self._unsure + float(np.hypot(increment[0], increment[1])) if held else 0.0
-            turned_over = self.doubt >= REVERSED or self._unsure > HOLD
-            if turned_over:
-                self._unsure = 0.0
-                self._sign = self._sign * OPPOSITE
-                self._motion, self.doubt = self._mirror_motion, 0.0
-                step = mirrored
-        if len(points.hits) >= MIN_POINTS and not _good(step):
-            step = self._search(points, se2.compose(self.pose, increment), increment, step)
-        step.reversed, step.forward = turned_over, bool(self._sign[0] > 0.0)
-        self.pose = step.pose
-        if self.doubt == 0.0:
-            self._mirror, self._mirror_motion = step.pose, self._motion
-        return step
-
-    def _follow(
-        self, points: Points, pose: FloatArray, increment: FloatArray, variances: FloatArray
-    ) -> tuple[Step, float]:
-        """The match after one increment, and its log-likelihood together with that of the increment it implies."""
-        prior = se2.compose(pose, increment)
-        step = self._match(points, prior.copy(), prior, np.diag(1.0 / variances))
-        off = se2.between(prior, step.pose)
-        surprise = 4.5 * math.log1p(float(off @ (off / variances)) / 9.0)
-        # As if all of the scan were in known space: driving back into it must not look better for that alone.
-        return step, EVIDENCE * step.log_likelihood / max(step.known, 0.1) - surprise
-
-    def _match(self, points: Points, start: FloatArray, prior: FloatArray, information: FloatArray) -> Step:
-        m = self.leader
-        hessian = np.empty((3, 3))
-        fit, near, free, log_likelihood = match(
-            self.maps.log_odds[m], self.maps.index[m], self.maps.surfels[m], self.maps.resolution,
-            points.hits, start, prior, information, self.parameters.sigma, hessian,
-        )  # fmt: skip
-        known = near + free
-        start[2] = se2.wrap(start[2])
-        return Step(start, fit / max(1, known), known / max(1, len(points.hits)), log_likelihood, hessian)
-
-    def _search(self, points: Points, prior: FloatArray, increment: FloatArray, best: Step) -> Step:
-        """The match is poor: odometry may be wrong. Look around, and if that does not help, far around.
-
-        A match far from what odometry says must explain so much more of the scan.
-        """
-        m = self.leader
-        stride = max(1, len(points.hits) // 90)
-        moved = float(np.hypot(increment[0], increment[1]))
-        turned = abs(float(increment[2]))
-        noise = motion.variance(increment, self.parameters.motion)
-
-        def merit(step: Step) -> float:
-            off = se2.between(prior, step.pose)
-            surprise = math.log1p(float(off @ (off / noise)) / 9.0)
-            return step.fit * step.known - DISBELIEF * surprise
-
-        for level, (reach_xy, reach_theta) in enumerate(
-            ((0.3 + 0.5 * moved, 0.2 + 0.3 * turned), (1.0 + 2.0 * moved, 0.6 + 0.5 * turned)), start=1
-        ):
-            reach_xy, reach_theta = min(reach_xy, 3.0), min(reach_theta, math.pi)
-            information = np.diag(9.0 / np.array([reach_xy, reach_xy, reach_theta]) ** 2)
-            peaks = np.empty((12, 3))
-            found = search(
-                self.maps.log_odds[m], self.maps.index[m], self.maps.surfels[m], self.maps.resolution, points.hits,
-                prior, reach_xy, 0.15, reach_theta, 0.04, information, stride, peaks, np.empty(12),
-            )  # fmt: skip
-            for k in range(found):
-                step = self._match(points, peaks[k].copy(), prior, information * 0.1)
-                step.searched = level
-                if merit(step) > merit(best) + MARGIN:
-                    best = step
-            if best.fit >= LOST_FIT:
-                break
-        return best
+    @property
+    def doubt(self) -> float:
+        """Log-likelihood by which odometry of the opposite sign explains the last scans better."""
+        return self._tracker.doubt
 
     def update(self, points: Points, mapping: bool) -> None:
         """One filter step on a key scan: propose, weigh, resample, map. ``track`` has been called for it before.
@@ -277,17 +157,15 @@ class ParticleFilter:
         Without ``mapping`` the maps stay as they are: the particles only localise.
         """
         p = self.parameters
-        count = p.particles
         self._steps += 1
-        priors = se2.compose(self.poses, self._motion)
-        moved = se2.between(self.poses[self.leader], self.pose)
+        priors = se2.compose(self.poses, self._tracker.motion)
+        moved = se2.between(self.poses[self.leader], self._tracker.pose)
         self.poses = se2.compose(self.poses, moved)
-        if np.any(self._variances > 0.0):
-            fits = np.empty(count)
+        if np.any(self._tracker.variances > 0.0):
             _propose(
                 self.maps.log_odds, self.maps.index, self.maps.surfels, self.maps.resolution, points.hits, priors,
-                self._variances, p.independence, p.sigma, self._seed, self._steps, self.poses, self._log_weights,
-                self._covariances, fits,
+                self._tracker.variances, p.independence, p.sigma, self._seed, self._steps, self.poses,
+                self._log_weights, self._covariances,
             )  # fmt: skip
             self.poses[:, 2] = se2.wrap(self.poses[:, 2])
         # The heaviest particle survives resampling, in its place.
@@ -296,19 +174,13 @@ class ParticleFilter:
         self._history.append((self.poses.copy(), parents))
         if mapping:
             self.insert(points, self.poses)
-        self.pose = self.poses[self.leader].copy()
-        self._rest()
-
-    def _rest(self) -> None:
-        """The particles are where the track is."""
-        self._variances, self._motion, self._mirror_motion = np.zeros(3), np.zeros(3), np.zeros(3)
-        self._mirror, self.doubt = self.pose, 0.0
+        self._tracker.rest(self.poses[self.leader].copy())
 
     def insert(self, points: Points, poses: FloatArray) -> None:
         """Add a scan to every particle's map, at ``poses`` (particles, 3)."""
         m = self.maps
         _insert_all(
-            m.log_odds, m.index, m.surfels, m.counts, m.bounds, m.resolution,
+            m.log_odds, m.index, m.surfels, m.counts, m.touched, m.resolution,
             poses, points.hits, points.clear, points.sensor,
         )  # fmt: skip
 
@@ -354,34 +226,6 @@ class ParticleFilter:
         c, s = np.cos(mean[2]), np.sin(mean[2])
         rotation = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         return mean, spread + rotation @ width @ rotation.T
-
-
-MIN_POINTS = 10  # fewer endpoints than this say nothing
-GOOD_FIT = 0.75  # a match that explains less than this of the known space, or
-GOOD_KNOWN = 0.25  # that has less than this in known space, is searched around
-LOST_FIT = 0.45  # below this also far around
-MARGIN = 0.05  # by how much a searched match must beat the plain one
-OPPOSITE = np.array([-1.0, -1.0, 1.0])
-HOLD = 0.7  # metres driven under the opposite sign without a scan that speaks for it, after which it is given up
-NO_GRIP, FULL_GRIP = 0.01, 0.06  # share of a scan's information that lies along the way driven
-STILL = 0.005  # metres: a robot that moves less between two scans has no direction
-EVIDENCE = 0.2  # of a scan's log-likelihood, in telling forward from backward
-REVERSED = 16.0  # log-likelihood at which odometry is taken to have the wrong sign,
-REVERSED_SCANS = 4  # and the least number of scans that must say so
-DISBELIEF = 0.08  # what it costs, in fit, to contradict odometry e times more
-
-
-def _good(step: Step) -> bool:
-    return step.fit >= GOOD_FIT and step.known >= GOOD_KNOWN
-
-
-def _grip(step: Step, increment: FloatArray) -> float:
-    """How well a scan tells the place along the way driven, 0 (a bare corridor) to 1."""
-    heading = float(step.pose[2]) + math.atan2(increment[1], increment[0])
-    along = np.array([math.cos(heading), math.sin(heading)])
-    information = step.hessian[:2, :2]
-    share = float(along @ information @ along) / max(float(np.trace(information)), 1e-9)
-    return min(1.0, max(0.0, (share - NO_GRIP) / (FULL_GRIP - NO_GRIP)))
 
 
 def first_run() -> bool:

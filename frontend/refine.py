@@ -12,7 +12,7 @@ from numba import njit, prange
 
 from frontend import se2
 from frontend.adjust import Adjusted, adjust
-from frontend.grid import Maps, insert
+from frontend.grid import TILE, Maps, at, insert
 from frontend.matching import match
 from frontend.parameters import FilterParameters
 from frontend.points import Points
@@ -106,21 +106,21 @@ def _smooth(poses, matched, hessians, motions, variances, out):  # type: ignore[
 @njit(cache=True, nogil=True)
 def _far_from(known, resolution, pose, hits, out):  # type: ignore[no-untyped-def]
     """Copy the hits that no surfel of the ``known`` index is near; returns how many."""
-    rows, columns = known.shape
+    columns = rows = len(known) * TILE
     c = math.cos(pose[2])
     s = math.sin(pose[2])
     n = 0
     for i in range(len(hits)):
         u = int((pose[0] + c * hits[i, 0] - s * hits[i, 1]) / resolution + 0.5 * columns)
         v = int((pose[1] + s * hits[i, 0] + c * hits[i, 1]) / resolution + 0.5 * rows)
-        if u < 0 or v < 0 or u >= columns or v >= rows or known[v, u] == 0:
+        if u < 0 or v < 0 or u >= columns or v >= rows or at(known, v, u) == 0:
             out[n] = hits[i]
             n += 1
     return n
 
 
 @njit(cache=True, nogil=True)
-def _draw(log_odds, index, surfels, count, bounds, resolution, hits, ends, clear, clear_ends, sensor, poses, known):  # type: ignore[no-untyped-def]
+def _draw(log_odds, index, surfels, count, touched, resolution, hits, ends, clear, clear_ends, sensor, poses, known):  # type: ignore[no-untyped-def]
     """Draw scans taken at ``poses``; with a ``known`` index (else of size 0) only what is far from its surfels."""
     last = -1
     new = np.empty_like(hits[: ends.max() if known.size else 0])
@@ -139,7 +139,7 @@ def _draw(log_odds, index, surfels, count, bounds, resolution, hits, ends, clear
         if known.size:
             scan = new[: _far_from(known, resolution, poses[i], scan, new)]
         count = insert(
-            log_odds, index, surfels, count, bounds, resolution, poses[i],
+            log_odds, index, surfels, count, touched, resolution, poses[i],
             scan, clear[clear_first : clear_ends[i]], sensor,
         )  # fmt: skip
     return count
@@ -149,14 +149,14 @@ def _drawn(
     base: Maps | None, packed: "_Packed", poses: FloatArray, parameters: FilterParameters, only_new: bool = False
 ) -> Maps:
     maps = Maps.empty(1, parameters.map_width, parameters.resolution)
-    known = np.empty((0, 0), np.uint16)
+    known = np.empty((0, 0, 0, 0), np.uint16)
     if base is not None:
         maps.copy_from(base, np.zeros(1, np.int64))
         if only_new:
             known = base.index[0]
     m = maps
     m.counts[0] = _draw(
-        m.log_odds[0], m.index[0], m.surfels[0], m.counts[0], m.bounds[0], m.resolution,
+        m.log_odds[0], m.index[0], m.surfels[0], m.counts[0], m.touched[0], m.resolution,
         packed.hits, packed.ends, packed.clear, packed.clear_ends, packed.sensor, poses, known,
     )  # fmt: skip
     return maps

@@ -41,7 +41,7 @@ def hypotheses(
     information = np.linalg.inv(widened)
     reach_xy = min(MAX_XY, 3.0 * math.sqrt(np.linalg.eigvalsh(widened[:2, :2])[1]))
     reach_theta = min(MAX_THETA, 3.0 * math.sqrt(widened[2, 2]))
-    layers = known.log_odds[0], known.index[0], known.surfels[0], known.resolution
+    layers = known.layers(0)
     peaks = np.empty((PEAKS, 3))
     stride = max(1, len(points.hits) // SEARCH_BEAMS)
     found = search(

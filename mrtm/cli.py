@@ -2,7 +2,7 @@
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,6 +32,10 @@ Options = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="One parameter, e.g. frontend.particles=60. Repeatable."),
 ]
 Preset = Annotated[str | None, typer.Option(metavar="NAME", help='"paper": the values of the paper.')]
+Session = Annotated[Path, typer.Argument(help="A team's YAML, or one robot's log of any known format.")]
+Seed = Annotated[int | None, typer.Option(help="Seed of all random numbers; as --set seed=N.")]
+Threads = Annotated[int | None, typer.Option(min=1, help="Cores to use; all if not given.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 
 
 @app.callback(invoke_without_command=True)
@@ -43,24 +47,22 @@ def _main(version: Annotated[bool, typer.Option("--version", help="Print the ver
 
 @app.command()
 def run(
-    log: Annotated[Path, typer.Argument(help="A robot's log; the format is found by its content.")],
-    out: Annotated[Path, typer.Option(help="Directory for map, trajectory and graph.")],
+    session: Session,
+    out: Annotated[Path, typer.Option(help="Directory for map, trajectories and graph.")],
     config: ConfigFile = None,
     options: Options = None,
     preset: Preset = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers; as --set seed=N.")] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="Threads; all cores if not given.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
+    seed: Seed = None,
+    threads: Threads = None,
+    quiet: Quiet = False,
 ) -> None:
-    """Map a building from a log."""
-    parameters = _load(config, preset, [*(options or ()), *([] if seed is None else [f"seed={seed}"])])
-    if threads is not None:
-        os.environ["NUMBA_NUM_THREADS"] = str(threads)  # numba reads it when it is imported, below
+    """Map a building with a team of robots, or from one robot's log."""
+    parameters = _parameters(config, preset, options, seed, threads)
     from mrtm.progress import showing
-    from mrtm.session import run_log
+    from mrtm.session import run_session
 
     with showing(quiet) as progress:
-        result = run_log(log, out, parameters, progress)
+        result = run_session(session, out, parameters, progress, threads)
     if not quiet:
         from mrtm.output.report import run_report
 
@@ -68,18 +70,52 @@ def run(
 
 
 @app.command()
+def compare(
+    session: Session,
+    out: Annotated[Path, typer.Option(help="Directory for the table and the figures.")],
+    config: ConfigFile = None,
+    options: Options = None,
+    preset: Preset = None,
+    seed: Seed = None,
+    threads: Threads = None,
+    quiet: Quiet = False,
+) -> None:
+    """Make the joint map three ways: before optimisation, by the paper's off-line EM, and on line."""
+    parameters = _parameters(config, preset, options, seed, threads)
+    from mrtm.progress import showing
+    from mrtm.session import compare_session
+
+    with showing(quiet) as progress:
+        scores = compare_session(session, out, parameters, progress, threads)
+    if not quiet:
+        from mrtm.compare import rows, table
+
+        _print([table(rows(scores)), f"the table and the paper's figures are in {out}"])
+
+
+@app.command()
 def evaluate(
     out: Annotated[Path, typer.Argument(help="What `mrtm run` left behind.")],
     relations: Annotated[Path | None, typer.Option(metavar="FILE", help="True relative poses.")] = None,
     truth: Annotated[Path | None, typer.Option(metavar="TUM", help="True or reference trajectory.")] = None,
+    session: Annotated[
+        Path | None, typer.Option(metavar="YAML", help="A team's session: its relations and truth, where not given.")
+    ] = None,
 ) -> None:
     """Measure a run against the truth."""
-    if relations is None and truth is None:
-        raise typer.BadParameter("give --relations FILE, --truth TUM, or both")
+    references: Mapping[str, Path] | Path | None = truth
+    if session is not None:
+        from mrtm.team.session_file import read_session
+
+        team = read_session(session)
+        relations, references = relations or team.relations, truth or team.truth
+    if not (relations or references):
+        given = "give" if session is None else f"{session} names neither relations nor truth; give"
+        raise typer.BadParameter(f"{given} --relations FILE, --truth TUM, or a --session YAML that names them")
     from mrtm.evaluation import evaluate_output
     from mrtm.output.report import evaluation_report
 
-    _print(evaluation_report(evaluate_output(out, relations, truth)))
+    _print(evaluation_report(evaluate_output(out, relations, references)))
 
 
 @app.command()
@@ -147,6 +183,16 @@ def _print(parts: "Sequence[RenderableType]") -> None:
     console = Console(soft_wrap=True, highlight=False)
     for part in parts:
         console.print(part)
+
+
+def _parameters(
+    file: Path | None, preset: str | None, options: Sequence[str] | None, seed: int | None, threads: int | None
+) -> "Config":
+    """The parameters of a run, and the number of threads set, before anything imports numba."""
+    parameters = _load(file, preset, [*(options or ()), *([] if seed is None else [f"seed={seed}"])])
+    if threads is not None:
+        os.environ["NUMBA_NUM_THREADS"] = str(threads)  # numba reads it when it is imported
+    return parameters
 
 
 def _load(file: Path | None, preset: str | None, options: Sequence[str]) -> "Config":

@@ -56,6 +56,22 @@ class TopologyParameters(Section):
     trial_lead: Annotated[float, Parameter("", "by which one place must beat all others", ge=0, le=1)] = 0.05
 
 
+@dataclass(frozen=True)
+class TeamParameters(Section):
+    """Meetings of robots (M9 to M11)."""
+
+    exchange_interval: Annotated[float, Parameter("s", "between two exchanges while robots see each other", gt=0)] = 5.0
+
+
+@dataclass(frozen=True)
+class JointParameters(Section):
+    """The joint map (M13)."""
+
+    alignments: Annotated[
+        int, Parameter("", "pairs of local maps aligned after an event, at most; 0 for none", paper="0", ge=0)
+    ] = 12
+
+
 class Config(BaseModel):
     """Every parameter of a run.
 
@@ -68,6 +84,8 @@ class Config(BaseModel):
     seed: Annotated[int, Parameter("", "of all random numbers: same seed, same result", ge=0, lt=2**63)] = 0
     frontend: FilterParameters = Field(default_factory=FilterParameters)
     topology: TopologyParameters = Field(default_factory=TopologyParameters)
+    team: TeamParameters = Field(default_factory=TeamParameters)
+    joint: JointParameters = Field(default_factory=JointParameters)
 
     @model_validator(mode="after")
     def _check(self) -> "Config":
@@ -81,6 +99,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "frontend": {"particles": 40, "sensing_range": 10.0, "map_width": 20.0, "travel_square": 10.0},
         "topology": {"projection": "dijkstra"},
+        "joint": {"alignments": 0},
     },
 }
 

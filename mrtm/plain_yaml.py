@@ -1,6 +1,7 @@
 """YAML as people write it by hand: what could make a small file cost much time or memory is refused.
 
-No aliases (a few nested ones stand for gigabytes), no deep nesting, no large files.
+No aliases (a few nested ones stand for gigabytes), no deep nesting, no large files. A key that stands twice, of which
+PyYAML would take the last and say nothing, is refused too.
 """
 
 from pathlib import Path
@@ -73,6 +74,8 @@ class _Loader(yaml.SafeLoader):
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
+        if isinstance(node, yaml.MappingNode):
+            _check_keys(node)
         return node
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
@@ -91,3 +94,13 @@ class _Loader(yaml.SafeLoader):
     def _check_depth(self, depth: int) -> None:
         if depth >= DEEPEST:
             raise yaml.scanner.ScannerError(None, None, f"nested deeper than {DEEPEST}", self.get_mark())
+
+
+def _check_keys(mapping: yaml.MappingNode) -> None:
+    seen = set()
+    for key, _ in mapping.value:
+        if isinstance(key, yaml.ScalarNode):
+            if (key.tag, key.value) in seen:
+                problem = f"the key {shorten(key.value, 40)} is there twice; remove one"
+                raise yaml.composer.ComposerError(None, None, problem, key.start_mark)
+            seen.add((key.tag, key.value))

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from factors import Edge, VertexId
+from factors import GraphEdge, VertexId
 from frontend.local_map import LocalMap
 from frontend.records import FloatArray
 
@@ -31,7 +31,7 @@ class Trajectory:
 class EdgeFate:
     """An edge that was ever made: ``fate`` is "accepted", "replaced" (by a newer version) or "refused", and why."""
 
-    edge: Edge
+    edge: GraphEdge
     fate: str
     reason: str = ""
     chi2: float = float("nan")
@@ -47,13 +47,65 @@ class Event:
     detail: dict[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class Meeting:
+    """Two robots that exchanged what they knew (M9, M10), and whether that brought them into one frame (M11).
+
+    Attributes:
+        time: team time, seconds.
+        robots: the two.
+        bytes: sent in both directions, by kind of record.
+        verdict: "accepted", "waiting" or "refused", of the sightings between the two as a whole.
+        reason: in words.
+    """
+
+    time: float
+    robots: tuple[str, str]
+    bytes: dict[str, int]
+    verdict: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class SightingFate:
+    """What became of a sighting: ``fate`` is "accepted", "waiting" or "refused", and why, with the ``numbers``."""
+
+    time: float
+    observer: str
+    observed: str
+    fate: str
+    reason: str
+    numbers: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class TeamStory:
+    """How the robots of a team found together.
+
+    Attributes:
+        meetings: in the order of team time.
+        sightings: likewise, as judged at the end with all that is known.
+        first_meeting: team time of the first meeting, seconds; None if nobody met.
+        common_frame: team time at which some robot first had all the robots of its component in its frame; None if
+            every robot stayed alone.
+        known: for every robot, the number of vertices that it had in its own frame at the end, by the robot that made
+            them.
+    """
+
+    meetings: list[Meeting]
+    sightings: list[SightingFate]
+    first_meeting: float | None
+    common_frame: float | None
+    known: dict[str, dict[str, int]]
+
+
 @dataclass(slots=True)
 class RunResult:
     """Everything a run knows at its end, in the joint frame of each component's root.
 
     ``timings`` are seconds by stage, ``longest`` those of the longest single call, ``counts`` plain numbers (scans,
     vertices, ...), ``blemishes`` one line each about what the log's reader met. ``components`` lists the vertices of
-    each connected component, root first.
+    each connected component, root first. ``team`` is None for a robot that was alone.
     """
 
     config: dict[str, Any]
@@ -69,3 +121,4 @@ class RunResult:
     longest: dict[str, float]
     counts: dict[str, int]
     blemishes: list[str]
+    team: TeamStory | None = None

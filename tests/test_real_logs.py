@@ -33,7 +33,8 @@ def check_loops(result: RunResult) -> None:
         assert fate.chi2 < CHI2_999, fate.edge
         edge = fate.edge
         a, b = result.vertex_poses[edge.tail], result.vertex_poses[edge.head]
-        strain = edge.measurement.between(a.between(b))
+        assert edge.estimate is not None
+        strain = edge.estimate.pose.between(a.between(b))
         assert np.hypot(strain.x(), strain.y()) < 0.5, edge
     assert len(result.components) == 1
 

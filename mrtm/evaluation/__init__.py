@@ -1,7 +1,8 @@
-"""How good a run is: relations, absolute trajectory error, honesty of covariances."""
+"""How good a run is: relations, absolute trajectory error, honesty of covariances, cost of meetings."""
 
 from mrtm.evaluation.ate import AbsoluteErrors, align, evaluate_ate
 from mrtm.evaluation.errors import EvaluationError
+from mrtm.evaluation.meetings import Meetings, Traffic, evaluate_meetings
 from mrtm.evaluation.nees import nees
 from mrtm.evaluation.output import Evaluation, Honesty, evaluate_output
 from mrtm.evaluation.relations import (
@@ -19,12 +20,15 @@ __all__ = [
     "Evaluation",
     "EvaluationError",
     "Honesty",
+    "Meetings",
     "RelationErrors",
     "Relations",
     "Statistics",
     "TimedPoses",
+    "Traffic",
     "align",
     "evaluate_ate",
+    "evaluate_meetings",
     "evaluate_output",
     "evaluate_relations",
     "interpolate",

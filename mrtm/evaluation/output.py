@@ -11,6 +11,7 @@ from frontend import se2
 from frontend.records import FloatArray
 from mrtm.evaluation.ate import AbsoluteErrors, evaluate_ate
 from mrtm.evaluation.errors import EvaluationError
+from mrtm.evaluation.meetings import Meetings, evaluate_meetings
 from mrtm.evaluation.nees import nees
 from mrtm.evaluation.relations import RelationErrors, evaluate_relations, read_relations
 from mrtm.evaluation.run_file import RunFile, read_run
@@ -39,6 +40,7 @@ class Evaluation:
         ate: the absolute trajectory error, one entry a connected component.
         vertices: honesty of the joint vertex poses, seen from their component's root.
         edges: honesty of the accepted edges, by kind.
+        meetings: what a team's meetings cost and brought; this needs no truth.
     """
 
     relations: RelationErrors | None = None
@@ -46,6 +48,7 @@ class Evaluation:
     ate: tuple[AbsoluteErrors, ...] = ()
     vertices: Honesty | None = None
     edges: dict[str, Honesty] | None = None
+    meetings: Meetings | None = None
 
 
 def evaluate_output(
@@ -79,6 +82,7 @@ def evaluate_output(
         ),
         vertices=_vertex_honesty(run, frames) if references else None,
         edges=_edge_honesty(run, frames) if references else None,
+        meetings=evaluate_meetings(run["team"]) if "team" in run else None,
     )
     with replacing(out / "evaluation.json") as path:
         path.write_text(to_json(asdict(evaluation)))
@@ -91,7 +95,7 @@ def _by_robot(truth: Mapping[str, Path] | Path | None, robots: list[str]) -> Map
     if isinstance(truth, Path):
         if len(robots) != 1:
             names = ", ".join(robots)
-            raise EvaluationError(f"{truth}: one truth for {len(robots)} robots; give one for each of {names}")
+            raise EvaluationError(f"{truth}: one truth for {len(robots)} robots ({names}); name one each in --session")
         return {robots[0]: truth}
     for robot, path in truth.items():
         if robot not in robots:

@@ -1,7 +1,7 @@
 """What the evaluation reads of a run's ``run.json``, checked."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, NotRequired
 
 import numpy as np
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
@@ -58,6 +58,20 @@ class EdgeEntry(TypedDict):
     covariance: _Covariance
 
 
+class MeetingEntry(TypedDict):
+    time: _Number
+    robots: tuple[_Robot, _Robot]
+    bytes: dict[str, Annotated[int, Field(ge=0, lt=2**53)]]
+    verdict: Literal["accepted", "waiting", "refused"]
+    reason: str
+
+
+class TeamEntry(TypedDict):
+    first_meeting: _Number | None
+    common_frame: _Number | None
+    meetings: list[MeetingEntry]
+
+
 class RunFile(TypedDict):
     """The part of ``run.json`` that the evaluation needs; see the export for what the keys mean."""
 
@@ -65,6 +79,7 @@ class RunFile(TypedDict):
     components: list[Annotated[list[_Name], Field(min_length=1)]]
     vertices: list[VertexEntry]
     edges: list[EdgeEntry]
+    team: NotRequired[TeamEntry]
 
 
 def read_run(out: Path) -> RunFile:

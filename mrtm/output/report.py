@@ -7,7 +7,7 @@ from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
-from mrtm.evaluation import AbsoluteErrors, Evaluation, RelationErrors, Statistics
+from mrtm.evaluation import AbsoluteErrors, Evaluation, Meetings, RelationErrors, Statistics
 from mrtm.result import RunResult
 
 FATES = ("accepted", "replaced", "refused")
@@ -57,6 +57,8 @@ def evaluation_report(evaluation: Evaluation) -> list[RenderableType]:
             numbers = [f"{value:.2f}" for value in (honesty.nees.mean, honesty.nees.median, honesty.nees.max)]
             table.add_row(name.replace("_", " "), *numbers, str(honesty.count))
         parts.append(table)
+    if evaluation.meetings is not None:
+        parts += _meetings(evaluation.meetings)
     return parts
 
 
@@ -86,8 +88,9 @@ def _timings(result: RunResult) -> Table:
     table = Table("stage")
     table.add_column("s", justify="right")
     table.add_column("%", justify="right")
-    total = _total(result)
-    for stage, seconds in result.timings.items():
+    stages = {stage: seconds for stage, seconds in result.timings.items() if stage != "total"}
+    total = sum(stages.values())  # of all processes together
+    for stage, seconds in stages.items():
         table.add_row(escape(stage), f"{seconds:.2f}", f"{100 * seconds / total:.0f}" if total > 0 else "")
     return table
 
@@ -109,6 +112,23 @@ def _add_relations(table: Table, name: str, errors: RelationErrors) -> None:
 def _add_ate(table: Table, errors: AbsoluteErrors) -> None:
     left_out = f"{errors.no_scan} no scan" if errors.no_scan else "0"
     _add_rows(table, ", ".join(errors.robots), errors.translation, errors.rotation, errors.count, left_out)
+
+
+def _meetings(meetings: Meetings) -> list[RenderableType]:
+    if meetings.first_meeting is None:
+        return ["[yellow]no two robots met[/]"]
+    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in meetings.verdicts.items())
+    count = sum(meetings.verdicts.values())
+    met = f"[bold]{count}[/] meetings ({verdicts}), the first at {meetings.first_meeting:.1f} s"
+    table = Table("bytes a meeting")
+    for column in ("mean", "median", "max", "all meetings"):
+        table.add_column(column, justify="right")
+    for name, traffic in (*meetings.traffic_by_kind.items(), ("together", meetings.traffic)):
+        numbers = traffic.per_meeting.mean, traffic.per_meeting.median, traffic.per_meeting.max, traffic.total
+        table.add_row(escape(name), *(f"{number:,.0f}" for number in numbers))
+    if meetings.to_common_frame is None:
+        return [met, "[yellow]no common frame[/]", table]
+    return [met, f"common frame [bold]{meetings.to_common_frame:.1f} s[/] of team time after it", table]
 
 
 def _add_rows(table: Table, name: str, metres: Statistics, degrees: Statistics, count: int, left_out: str) -> None:

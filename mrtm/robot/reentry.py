@@ -14,9 +14,9 @@ from factors import UncertainPose, VertexId, compose, inverse
 from frontend import se2
 from frontend.grid import Maps
 from frontend.local_slam import SPREAD, LocalSlam
-from frontend.rbpf import Step
 from frontend.records import FloatArray
 from frontend.relocalisation import hypotheses
+from frontend.tracking import Step
 from mrtm.config import TopologyParameters
 from mrtm.robot.poses import array_of, exactly, innovation
 from mrtm.robot.topology import Vertex

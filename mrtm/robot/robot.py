@@ -1,13 +1,14 @@
 """One robot's TM-SLAM: steps M1 to M8, scan by scan."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 
 from factors import Edge, EdgeKind, UncertainPose, VertexId, compose, intersect, inverse
 from frontend import se2
-from frontend.local_slam import LocalSlam
+from frontend.local_slam import LocalSlam, Visit
 from frontend.points import Points, points_of
 from frontend.records import FloatArray, LaserScan
 from frontend.relocalisation import hypotheses
@@ -15,7 +16,7 @@ from mrtm.config import Config
 from mrtm.result import Event
 from mrtm.robot.poses import array_of, innovation, pose_of
 from mrtm.robot.reentry import Candidate, Trial, candidates
-from mrtm.robot.topology import Topology
+from mrtm.robot.topology import Topology, Vertex
 from mrtm.timing import Stages
 
 
@@ -37,6 +38,7 @@ class Robot:
         config: of the run.
         make_joint: given the first vertex (M1), the joint map to work with.
         notify: told of every event.
+        visited: told whenever a vertex's map has been closed: vertex, index of the visit's first scan, visit.
         stages: counts the time of every stage.
     """
 
@@ -46,6 +48,7 @@ class Robot:
         config: Config,
         make_joint: Callable[[VertexId], Joint],
         notify: Callable[[Event], None],
+        visited: Callable[[Vertex, int, Visit], None],
         stages: Stages,
     ) -> None:
         self.name = name
@@ -53,6 +56,7 @@ class Robot:
         self.topology = Topology(name)
         self.times: list[float] = []
         self._notify = notify
+        self._visited = visited
         self._stages = stages
         self._slam = LocalSlam(config.frontend, config.seed)
         self._half_width = 0.5 * config.frontend.travel_square
@@ -76,6 +80,16 @@ class Robot:
             self._slam.begin(points, self._at_origin())
         else:
             self._advance(points, increment)
+
+    def whereabouts(self, scan: int) -> tuple[VertexId, UncertainPose] | None:
+        """The vertex and the pose in it, ``local_T_robot``, at a scan of the present visit, as far as is known now.
+
+        None for a scan of an earlier visit, and while a re-entry is on trial.
+        """
+        if self._trial is not None or not self._first <= scan <= self._scan:
+            return None
+        pose = self._slam.path()[scan - self._first]
+        return self._here.id, UncertainPose(pose_of(pose), self._slam.covariance())
 
     def finish(self) -> None:
         """M12: the log is at its end; close the vertex the robot is in."""
@@ -114,7 +128,8 @@ class Robot:
         here.maps, here.spread = visit.maps, visit.spread
         here.scans.extend(range(self._first, self._first + len(visit.poses)))
         here.poses.extend(visit.poses)
-        here.drawn_from(visit.poses[visit.chosen], np.array([c.covariance for c in chosen]))
+        known = np.array([pose.covariance for pose in chosen])
+        here.drawn_from(visit.poses[visit.chosen], known)
         self._tell(
             "left vertex",
             vertex=str(here.id),
@@ -123,6 +138,7 @@ class Robot:
             sigma=round(visit.sigma, 5),
         )
         self._update_edge(chosen[0])
+        self._visited(here, self._first, replace(visit, covariances=known))
         return chosen[-1]
 
     def _update_edge(self, entered: UncertainPose) -> None:

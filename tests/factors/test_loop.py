@@ -15,7 +15,7 @@ def test_covariance_frame(checks: Any) -> None:
     checks.covariance_is_in_the_frame_of_the_child(EdgeKind.LOOP, loop_factor)
 
 
-def _cost(factor: gtsam.BetweenFactorPose2, edge: Any, sigmas: float) -> float:
+def _cost(factor: gtsam.NoiseModelFactor, edge: Any, sigmas: float) -> float:
     """The factor's cost at a residual of so many standard deviations."""
     root = np.linalg.cholesky(edge.covariance)
     values = gtsam.Values()

@@ -1,8 +1,7 @@
 import gtsam
 import numpy as np
-import pytest
 
-from factors import FactorError, UncertainPose, adjoint_transport, compose, inverse, particle_estimate
+from factors import UncertainPose, adjoint_transport, compose, inverse
 
 A_T_B = UncertainPose(gtsam.Pose2(6.0, -3.0, 2.1), np.diag([0.02, 0.005, 0.003]) ** 2)
 B_T_C = UncertainPose(gtsam.Pose2(-4.0, 7.0, -1.2), np.diag([0.004, 0.03, 0.002]) ** 2)
@@ -48,46 +47,3 @@ def test_composition_is_associative() -> None:
     right = compose(A_T_B, compose(B_T_C, A_T_B))
     assert left.pose.equals(right.pose, 1e-12)
     np.testing.assert_allclose(left.covariance, right.covariance, rtol=1e-9, atol=1e-15)
-
-
-def test_particles_give_back_what_they_were_drawn_from(rng: np.random.Generator) -> None:
-    source = UncertainPose(gtsam.Pose2(2.0, 1.0, 3.1), np.diag([0.3, 0.05, 0.2]) ** 2)  # straddles pi
-    particles = np.array([[p.x(), p.y(), p.theta()] for p in draw(source, rng, 20000)])
-    found = particle_estimate(particles, np.ones(len(particles)))
-    assert gtsam.Pose2.Logmap(source.pose.between(found.pose)) == pytest.approx(np.zeros(3), abs=0.015)
-    assert_same_covariance(found.covariance, source.covariance)
-
-
-def test_particle_mean_is_the_one_of_the_group(rng: np.random.Generator) -> None:
-    particles = rng.normal(0.0, 0.5, (30, 3)) + np.array([4.0, 0.0, np.pi])
-    weights = rng.uniform(0.0, 3.0, 30)
-    found = particle_estimate(particles, weights)
-    logs = np.array([gtsam.Pose2.Logmap(found.pose.between(gtsam.Pose2(*p))) for p in particles])
-    np.testing.assert_allclose(weights @ logs, 0.0, atol=1e-9)
-    shares = weights / weights.sum()
-    np.testing.assert_allclose(found.covariance, (shares[:, None] * logs).T @ logs, atol=1e-12)
-
-
-def test_weights_count_as_copies(rng: np.random.Generator) -> None:
-    particles = rng.normal(0.0, 0.1, (5, 3))
-    counts = np.array([1.0, 2.0, 0.0, 3.0, 1.0])
-    weighted = particle_estimate(particles, counts)
-    copied = particle_estimate(np.repeat(particles, counts.astype(int), axis=0), np.ones(7))
-    assert weighted.pose.equals(copied.pose, 1e-9)
-    np.testing.assert_allclose(weighted.covariance, copied.covariance, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("particles", "weights"),
-    [
-        (np.full((4, 3), np.nan), np.ones(4)),
-        (np.zeros((4, 2)), np.ones(4)),
-        (np.zeros((4, 3)), np.ones(3)),
-        (np.zeros((4, 3)), np.zeros(4)),
-        (np.zeros((4, 3)), np.array([1.0, -1.0, 1.0, 1.0])),
-        (np.zeros((4, 3)), np.array([1.0, np.nan, 1.0, 1.0])),
-    ],
-)
-def test_refuses_unusable_particles(particles: np.ndarray, weights: np.ndarray) -> None:
-    with pytest.raises(FactorError):
-        particle_estimate(particles, weights)

@@ -1,7 +1,8 @@
 """What the front end's numba kernels compute, slowly and obviously: plain Python and float64, one beam at a time.
 
-Written from the docstrings, not translated from the kernels. Constants are the kernels' own. A cell is found with
-``int``, which rounds towards zero: a strip one cell wide outside the map counts as its outermost cells.
+Written from the docstrings, not translated from the kernels. Constants are the kernels' own. Maps are arrays of cells,
+row by row, not of tiles. Matching finds a cell with ``int``, which rounds towards zero: a strip one cell wide outside
+the map counts as its outermost cells.
 """
 
 import math
@@ -90,7 +91,7 @@ class Map:
         self.index = np.zeros((self.cells, self.cells), int)
 
     def cell(self, xy: FloatArray) -> Cell:
-        u, v = np.asarray(xy, np.float64) / self.resolution + self.cells / 2
+        u, v = np.floor(np.asarray(xy, np.float64) / self.resolution + self.cells / 2)
         return int(u), int(v)
 
     def add(self, pose: FloatArray, hits: Floats, clear: Floats, sensor: FloatArray) -> None:
@@ -183,11 +184,12 @@ def evaluate(
 ) -> Evaluation:
     """``matching.match``'s view of one pose in map 0 of a stack."""
     result = Evaluation(0.0, 0, 0, 0.0, np.zeros((3, 3)), np.zeros(3), [])
+    log_odds, index = grid.in_rows(maps.log_odds[0]), grid.in_rows(maps.index[0])
     for hit in hits.astype(np.float64):
-        u, v = (int(x) for x in moved(pose, hit[None, :2])[0] / maps.resolution + maps.log_odds.shape[1] / 2)
-        if not (0 <= u < maps.log_odds.shape[2] and 0 <= v < maps.log_odds.shape[1]):
+        u, v = (int(x) for x in moved(pose, hit[None, :2])[0] / maps.resolution + len(index) / 2)
+        if not (0 <= u < len(index) and 0 <= v < len(index)):
             continue
-        pairing = _pair(maps.surfels[0, maps.index[0, v, u]].astype(np.float64), hit, pose, sigma, gate)
+        pairing = _pair(maps.surfels[0, index[v, u]].astype(np.float64), hit, pose, sigma, gate)
         if pairing is not None:
             e, jacobian = residual(pairing, pose)
             m = float(e @ e)
@@ -198,7 +200,7 @@ def evaluate(
             result.fit += 1.0 / (1.0 + m / 4.0)
             result.log_likelihood -= geman_mcclure(m)
             result.pairings.append(pairing)
-        elif maps.log_odds[0, v, u] < matching.FREE:
+        elif log_odds[v, u] < matching.FREE:
             result.free += 1
             result.log_likelihood -= geman_mcclure(math.inf)
     return result
@@ -241,12 +243,12 @@ def search_score(maps: grid.Maps, hits: Floats, pose: FloatArray, centre: FloatA
     near = free = 0
     turned = np.append(centre[:2], pose[2])
     shift = (pose - centre)[:2] / maps.resolution
-    half = maps.log_odds.shape[1] / 2
-    for at in (moved(turned, hits[:, :2]) / maps.resolution + half).astype(np.float32):
+    log_odds, index = grid.in_rows(maps.log_odds[0]), grid.in_rows(maps.index[0])
+    for at in (moved(turned, hits[:, :2]) / maps.resolution + len(index) / 2).astype(np.float32):
         u, v = (int(x) for x in at + shift)
-        if 0 <= u < maps.log_odds.shape[2] and 0 <= v < maps.log_odds.shape[1]:
-            near += maps.index[0, v, u] > 0
-            free += maps.index[0, v, u] == 0 and maps.log_odds[0, v, u] < matching.FREE
+        if 0 <= u < len(index) and 0 <= v < len(index):
+            near += index[v, u] > 0
+            free += index[v, u] == 0 and log_odds[v, u] < matching.FREE
     off = pose - centre
     return (near - free) / len(hits) - 0.05 * math.log1p(float(off @ information @ off) / 9.0)
 

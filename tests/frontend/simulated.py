@@ -41,14 +41,9 @@ def look(plan: FloorPlan, poses: FloatArray, laser: LaserModel = LMS200, sensing
 def insert(maps: Maps, points: Points, pose: FloatArray) -> None:
     """Add a scan to map 0 of a stack."""
     maps.counts[0] = grid.insert(
-        *layers(maps)[:3], maps.counts[0], maps.bounds[0], maps.resolution,
+        *maps.layers(0)[:3], maps.counts[0], maps.touched[0], maps.resolution,
         pose, points.hits, points.clear, points.sensor,
     )  # fmt: skip
-
-
-def layers(maps: Maps, p: int = 0) -> tuple[object, object, object, float]:
-    """Map p of a stack as the kernels of ``matching`` take it."""
-    return maps.log_odds[p], maps.index[p], maps.surfels[p], maps.resolution
 
 
 def drawn(points: list[Points], poses: FloatArray, width: float = WIDTH) -> Maps:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from frontend import grid
-from frontend.grid import Maps
+from frontend.grid import Maps, in_rows
 from frontend.points import Points
 from frontend.records import FloatArray
 from tests.frontend import reference
 from tests.frontend.simulated import RESOLUTION, ROOM, insert, look
 
-LAYERS = ("log_odds", "index", "surfels", "counts", "bounds")
+LAYERS = ("log_odds", "index", "surfels", "counts", "touched")
 GUARD = 5000  # values before and after each array that nobody may write
 
 
@@ -31,47 +31,44 @@ def guarded(maps: Maps) -> tuple[Maps, list[Any]]:
     fences = []
     for name in LAYERS:
         array = getattr(maps, name)
-        memory = np.full(array.size + 2 * GUARD, 77, array.dtype)
+        memory = np.full(array.size + 2 * GUARD, 0 if array.dtype == bool else 77, array.dtype)
         inside = memory[GUARD:-GUARD].reshape(array.shape)
         inside[...] = array
         fields[name] = inside
-        fences += [memory[:GUARD], memory[-GUARD:]]
+        fences += [(memory[:GUARD], memory[0].copy()), (memory[-GUARD:], memory[0].copy())]
     return replace(maps, **fields), fences
 
 
 def same(maps: Maps, expected: reference.Map, p: int = 0) -> None:
-    np.testing.assert_array_equal(maps.log_odds[p], expected.log_odds)
-    np.testing.assert_array_equal(maps.index[p], expected.index)
+    np.testing.assert_array_equal(in_rows(maps.log_odds[p]), expected.log_odds)
+    np.testing.assert_array_equal(in_rows(maps.index[p]), expected.index)
     assert maps.counts[p] == len(expected.surfels)
     np.testing.assert_allclose(maps.surfels[p, 1 : maps.counts[p]], np.array(expected.surfels)[1:], atol=1e-5)
 
 
-def outside_bounds_is_blank(maps: Maps) -> None:
-    for log_odds, index, (r0, r1, c0, c1) in zip(maps.log_odds, maps.index, maps.bounds, strict=True):
-        inside = np.zeros(log_odds.shape, bool)
-        inside[r0:r1, c0:c1] = True
-        assert not log_odds[~inside].any()
-        assert not index[~inside].any()
+def untouched_is_blank(maps: Maps) -> None:
+    assert not maps.log_odds[~maps.touched].any()
+    assert not maps.index[~maps.touched].any()
 
 
 def identical(a: Maps, p: int, b: Maps, q: int) -> None:
     np.testing.assert_array_equal(a.log_odds[p], b.log_odds[q])
     np.testing.assert_array_equal(a.index[p], b.index[q])
-    np.testing.assert_array_equal(a.bounds[p], b.bounds[q])
+    np.testing.assert_array_equal(a.touched[p], b.touched[q])
     assert a.counts[p] == b.counts[q]
     np.testing.assert_array_equal(a.surfels[p, 1 : a.counts[p]], b.surfels[q, 1 : b.counts[q]])
 
 
 def inserted_like_the_reference(width: float, poses: FloatArray, capacity: int = 30000, every: int = 3) -> Maps:
     maps, fences = guarded(Maps.empty(1, width, RESOLUTION, capacity))
-    expected = reference.Map(round(width / RESOLUTION), RESOLUTION, capacity)
+    expected = reference.Map(maps.touched.shape[1] * grid.TILE, RESOLUTION, capacity)
     seen = look(ROOM, np.tile([0.0, 0.0, 0.3], (len(poses), 1)), sensing_range=4.5)
     for pose, points in zip(poses, seen, strict=True):
         some = Points(points.hits[::every].copy(), points.clear[::every].copy(), np.array([0.05, -0.1]))
         insert(maps, some, pose)
         expected.add(pose, some.hits, some.clear, some.sensor)
     same(maps, expected)
-    assert all((fence == 77).all() for fence in fences)
+    assert all((fence == value).all() for fence, value in fences)
     return maps
 
 
@@ -82,7 +79,7 @@ def test_insert_agrees_with_the_reference() -> None:
     maps = inserted_like_the_reference(16.0, POSES)
     assert maps.counts[0] > 100
     assert (maps.surfels[0, :, grid.N] > 1).any()
-    outside_bounds_is_blank(maps)
+    untouched_is_blank(maps)
 
 
 def test_insert_agrees_with_the_reference_scan_after_scan() -> None:
@@ -92,7 +89,7 @@ def test_insert_agrees_with_the_reference_scan_after_scan() -> None:
     maps = inserted_like_the_reference(16.0, poses, every=6)
     assert maps.log_odds.min() <= -grid.LIMIT
     assert (maps.surfels[0, 1 : maps.counts[0], grid.N] == 0).any()
-    outside_bounds_is_blank(maps)
+    untouched_is_blank(maps)
 
 
 BORDER = [(2.9, 0.1, 0.3), (-2.96, 2.9, 2.0), (3.3, -0.2, 3.1), (-3.4, -3.3, -2.2), (0.1, 40.0, 1.0), (1e5, -1e5, 0.2)]
@@ -104,14 +101,14 @@ def test_beyond_the_border_nothing_is_written(pose: tuple[float, float, float]) 
 
 
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), *BORDER[:3]])
-def test_bounds_hold_all_that_was_touched(pose: tuple[float, float, float]) -> None:
+def test_tiles_that_were_written_to_count_as_touched(pose: tuple[float, float, float]) -> None:
     """A map smaller than the laser's reach, as the paper's 20 m: most beams leave it."""
     maps = Maps.empty(1, 6.0, RESOLUTION)
     rng = np.random.default_rng(4)
     for length in (8.0, 4.0, 1.0):
         angle = rng.uniform(0.2, 1.2, 30)
         insert(maps, scan(length * np.column_stack((np.cos(angle), np.sin(angle)))), np.array(pose))
-    outside_bounds_is_blank(maps)
+    untouched_is_blank(maps)
 
 
 def test_log_odds_stay_within_their_limits() -> None:
@@ -142,21 +139,22 @@ def test_the_index_names_the_nearest_surfel() -> None:
     """Of those whose cell is within REACH cells; one endpoint a cell, so that no surfel moves."""
     rng = np.random.default_rng(8)
     maps = Maps.empty(1, 6.0, RESOLUTION)
-    cells = rng.permutation(np.array([(u, v) for u in range(20, 90) for v in range(20, 90)]))[:150]
-    ends = (cells + rng.uniform(0.05, 0.95, (150, 2)) - 60) * RESOLUTION
+    cells = rng.permutation(np.array([(u, v) for u in range(25, 95) for v in range(25, 95)]))[:150]
+    ends = (cells + rng.uniform(0.05, 0.95, (150, 2)) - 64) * RESOLUTION
     # A cell of its own for each: a neighbour's endpoint may be nearer to the middle of a cell than its own.
     apart = [i for i in range(150) if all(np.abs(cells[i] - cells[j]).max() > 1 for j in range(i))]
     insert(maps, scan(ends[apart]), np.zeros(3))
     ends, cells = ends[apart].astype(np.float32), cells[apart]
-    for v in range(120):
-        for u in range(120):
-            centre = (np.array([u, v]) + 0.5 - 60) * RESOLUTION
+    index = in_rows(maps.index[0])
+    for v in range(128):
+        for u in range(128):
+            centre = (np.array([u, v]) + 0.5 - 64) * RESOLUTION
             near = np.hypot(*(cells - (u, v)).T) <= grid.REACH
             distances = np.where(near, np.hypot(*(ends - centre).T), np.inf)
             if near.any():
-                assert distances[maps.index[0, v, u] - 1] == pytest.approx(distances.min(), abs=1e-6)
+                assert distances[index[v, u] - 1] == pytest.approx(distances.min(), abs=1e-6)
             else:
-                assert maps.index[0, v, u] == 0
+                assert index[v, u] == 0
 
 
 def test_what_moved_away_dies_and_what_it_stood_before_lives() -> None:
@@ -177,7 +175,7 @@ def test_what_moved_away_dies_and_what_it_stood_before_lives() -> None:
 def test_a_full_table_takes_no_more_surfels() -> None:
     maps = inserted_like_the_reference(16.0, POSES, capacity=20)
     assert maps.counts[0] == 20
-    outside_bounds_is_blank(maps)
+    untouched_is_blank(maps)
 
 
 def stack(particles: int, seed: int) -> Maps:
@@ -232,3 +230,27 @@ def test_a_map_whose_beams_left_it_is_cleared_all_over(pose: tuple[float, float,
     assert maps.log_odds.any()
     maps.clear()
     assert not maps.log_odds.any()
+
+
+def test_what_is_known_of_a_map_is_cut_out_at_its_place() -> None:
+    maps = Maps.empty(2, 8.0, RESOLUTION)
+    insert(maps, scan(np.array([[1.02, 0.02], [0.02, -3.01]])), np.zeros(3))
+    part, corner = maps.known(0)
+    whole = in_rows(maps.log_odds[0])
+    u, v = np.round(corner / RESOLUTION + 0.5 * len(whole)).astype(int)
+    np.testing.assert_array_equal(whole[v : v + part.shape[0], u : u + part.shape[1]], part)
+    assert np.count_nonzero(whole) == np.count_nonzero(part)
+    assert part.shape == (62, 21)  # from the hit at y = -3.01 m to the cell above the sensor's axis, 1.02 m across
+    assert maps.known(1)[0].size == 0
+
+
+def test_maps_that_nothing_was_drawn_in_take_no_memory() -> None:
+    """Nor do tiles that no beam touched: pages, not huge ones, are what the system hands out."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    maps = Maps.empty(100, 70.0, RESOLUTION)  # 590 MB of addresses
+    for p in range(100):
+        one = replace(maps, **{layer: getattr(maps, layer)[p : p + 1] for layer in LAYERS})
+        insert(one, scan(np.array([[1.0, 1.0]])), np.zeros(3))
+    assert maps.log_odds.nbytes + maps.index.nbytes > 5e8
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50e3  # kB

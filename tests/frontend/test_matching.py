@@ -12,7 +12,7 @@ from frontend.grid import Maps
 from frontend.points import Points
 from frontend.records import FloatArray
 from tests.frontend import reference
-from tests.frontend.simulated import CORRIDOR, RESOLUTION, ROOM, drawn, layers, look, room
+from tests.frontend.simulated import CORRIDOR, RESOLUTION, ROOM, drawn, look, room
 
 SIGMA = 0.02
 LOOSE = np.diag([1.0, 1.0, 1.0]) * 1e-3
@@ -25,7 +25,7 @@ def matched(
 ) -> tuple[FloatArray, FloatArray, tuple[float, int, int, float]]:
     """Pose, Hessian, and what ``match`` returns."""
     pose, hessian = start.copy(), np.full((3, 3), np.nan)
-    result = matching.match(*layers(maps), points.hits, pose, prior, information, SIGMA, hessian)
+    result = matching.match(*maps.layers(0), points.hits, pose, prior, information, SIGMA, hessian)
     return pose, hessian, result
 
 
@@ -145,7 +145,7 @@ def search(
     """Lattice of 0.15 m and 0.05 rad, ``reach`` steps to each side."""
     places, scores = np.full((peaks, 3), np.nan), np.full(peaks, np.nan)
     found = matching.search(
-        *layers(maps), hits, centre, (reach[0] - 0.5) * 0.15, 0.15, (reach[1] - 0.5) * 0.05, 0.05, information, 1,
+        *maps.layers(0), hits, centre, (reach[0] - 0.5) * 0.15, 0.15, (reach[1] - 0.5) * 0.05, 0.05, information, 1,
         places, scores,
     )  # fmt: skip
     return places[:found], scores[:found]

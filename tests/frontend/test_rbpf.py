@@ -14,7 +14,7 @@ from frontend.parameters import FilterParameters, MotionParameters
 from frontend.rbpf import ParticleFilter
 from frontend.records import FloatArray
 from tests.frontend.reference import Floats
-from tests.frontend.simulated import PARAMETERS, ROOM, layers, look, room
+from tests.frontend.simulated import PARAMETERS, ROOM, look, room
 
 SMALL = FilterParameters(particles=12, map_width=13.0)
 
@@ -91,9 +91,7 @@ def test_the_proposal_is_the_gaussian_around_the_match() -> None:
     information[2, 2] = 1 / variances[2]
 
     mean, hessian = prior.copy(), np.empty((3, 3))
-    fit, near, free, log_likelihood = match(
-        *layers(maps), points.hits, mean, prior, information, PARAMETERS.sigma, hessian
-    )
+    *_, log_likelihood = match(*maps.layers(0), points.hits, mean, prior, information, PARAMETERS.sigma, hessian)
     covariance = np.linalg.inv(hessian + information)
     off = mean - prior
     log_weight = (
@@ -105,15 +103,14 @@ def test_the_proposal_is_the_gaussian_around_the_match() -> None:
     samples = []
     for step in range(steps):
         poses, log_weights = np.tile(prior, (count, 1)), np.arange(count, dtype=np.float64)
-        covariances, fits = np.empty((count, 3, 3)), np.empty(count)
+        covariances = np.empty((count, 3, 3))
         rbpf._propose(
             maps.log_odds, maps.index, maps.surfels, maps.resolution, points.hits, np.tile(prior, (count, 1)),
-            variances, PARAMETERS.independence, PARAMETERS.sigma, 5, step, poses, log_weights, covariances, fits,
+            variances, PARAMETERS.independence, PARAMETERS.sigma, 5, step, poses, log_weights, covariances,
         )  # fmt: skip
         samples.append(poses)
         np.testing.assert_allclose(log_weights, np.arange(count) + log_weight, rtol=1e-6)
         np.testing.assert_allclose(covariances, np.tile(covariance, (count, 1, 1)), rtol=1e-6)
-        np.testing.assert_allclose(fits, fit / (near + free), rtol=1e-9)
     is_drawn_from(np.concatenate(samples), mean, covariance)
 
 

@@ -3,7 +3,6 @@
 import bz2
 import gzip
 import lzma
-import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from hypothesis import strategies as st
 from frontend.errors import LogError
 from frontend.readers import lines, open_log
 from frontend.records import LaserScan
+from tests.frontend.memory import peak_memory
 
 HEADER = "# message_name [message contents] ipc_timestamp ipc_hostname logger_timestamp\n"
 LOG = HEADER + "".join(f"FLASER 3 1.0 2.0 {3 + i} {i} 0 0 {i} 0 0 {100 + i}.5 host {i}.0\n" for i in range(40))
@@ -170,12 +170,7 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     def peak(count: int) -> int:
         rows = (f"FLASER 50 {'1.25 ' * 50}0 0 0 {i} 0 0 {i} host 0\n" for i in range(count))
         log = open_log(written(tmp_path / "log", gzip.compress("".join(rows).encode())))
-        tracemalloc.start()
-        for _ in log.scans():
-            pass
-        _, most = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        return most
+        return peak_memory(log)
 
     assert peak(12000) < 1.2 * peak(3000)
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from frontend.errors import LogError
 from frontend.readers import Log, open_log
 from frontend.records import LaserScan
+from tests.frontend.memory import peak_memory
 from tests.frontend.rawlog_bytes import Writer, about_x, about_z, text, ticks
 
 NEW = Writer()
@@ -309,14 +310,9 @@ def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     def peak(count: int) -> int:
         blocks = (NEW.odometry((i, 0, 0), i) + NEW.scan([2.0] * 100, i) + STRANGER for i in range(1, count))
         log = written(tmp_path, b"".join(blocks))
-        tracemalloc.start()
-        for _ in log.scans():
-            pass
-        _, most = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        return most
+        return peak_memory(log)
 
-    assert peak(6000) < 1.2 * peak(1500)
+    assert peak(3600) < 1.2 * peak(1200)
 
 
 def test_headers_are_found_across_blocks(tmp_path: Path) -> None:

@@ -103,7 +103,7 @@ def test_the_poses_of_a_visit_get_better() -> None:
 def test_a_known_map_holds_the_poses() -> None:
     """With what earlier visits knew, the first pose need not stay, and what they knew does."""
     base = room()[2]
-    layers = ("log_odds", "index", "surfels", "counts", "bounds")
+    layers = ("log_odds", "index", "surfels", "counts", "touched")
     frozen = [getattr(base, layer).copy() for layer in layers]
     log, points, increments = drive()
     true = log.poses[:40]

@@ -1,5 +1,6 @@
 """The command line as a user meets it: a process, its output and its exit code."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -7,7 +8,12 @@ from pathlib import Path
 import pytest
 
 import mrtm
-from mrtm.config import load_config
+from mrtm.config import load_config, to_yaml
+from tests.mrtm.small_logs import ring, small
+from tools.fuzzing.seeds import RUNS, TRAJECTORIES
+from tools.simulation import write_carmen, write_tum
+
+DEMO = Path(__file__).parents[2] / "data" / "demo"
 
 HEAVY = ("numpy", "scipy", "numba", "gtsam", "matplotlib", "pydantic.main", "yaml")
 
@@ -22,7 +28,7 @@ def test_version() -> None:
     assert (done.returncode, done.stdout.strip()) == (0, f"mrtm {mrtm.__version__}")
 
 
-@pytest.mark.parametrize("command", [(), ("run",), ("evaluate",), ("config",)])
+@pytest.mark.parametrize("command", [(), ("run",), ("compare",), ("evaluate",), ("config",)])
 def test_help(command: tuple[str, ...]) -> None:
     done = call(*command, "--help")
     assert done.returncode == 0
@@ -53,7 +59,9 @@ def test_config_prints_what_config_reads(tmp_path: Path) -> None:
         (("run", "missing.clf", "--out", "OUT", "--quiet"), "missing.clf: no such file"),
         (("run", "missing.clf", "--out", "OUT", "--seed", "-1"), "seed is -1: must be at least 0"),
         (("run", "EMPTY", "--out", "OUT", "--quiet"), "is empty"),
+        (("compare", "missing.yaml", "--out", "OUT", "--quiet"), "missing.yaml: cannot be read"),
         (("evaluate", "OUT", "--relations", "missing.relations"), "OUT"),
+        (("evaluate", "OUT", "--session", "missing.yaml"), "missing.yaml: cannot be read"),
     ],
 )
 def test_a_user_error_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
@@ -65,6 +73,62 @@ def test_a_user_error_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tup
     assert done.stderr.count("\n") == 1
     assert done.stderr.startswith("error: ")
     assert said in done.stderr
+
+
+def test_a_session_names_what_to_measure_against(tmp_path: Path) -> None:
+    (tmp_path / "trajectory").mkdir()
+    (tmp_path / "trajectory" / "robot.tum").write_bytes(TRAJECTORIES[0])
+    (tmp_path / "run.json").write_bytes(RUNS[0])
+    (tmp_path / "true.tum").write_bytes(TRAJECTORIES[0])
+    (tmp_path / "true.relations").write_text("3.5 5.5 -2 0 0 0 0 0\n")
+    session = tmp_path / "team.yaml"
+    team = "robots: {robot: {log: elsewhere.clf}}\n"  # the log is not needed
+    session.write_text(f"{team}relations: true.relations\ntruth: {{robot: true.tum}}\n")
+    done = call("evaluate", tmp_path, "--session", session)
+    assert (done.returncode, done.stderr) == (0, "")
+    measured = json.loads((tmp_path / "evaluation.json").read_text())
+    assert measured["relations"]["count"] == 1
+    assert measured["ate"][0]["count"] == 20
+    done = call("evaluate", tmp_path, "--session", session, "--relations", tmp_path / "mine.relations")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "mine.relations: cannot be read" in done.stderr
+    session.write_text(team)
+    done = call("evaluate", tmp_path, "--session", session)
+    assert done.returncode == 2
+    assert "names neither" in done.stderr
+
+
+def test_a_comparison_prints_a_table_and_leaves_figures(tmp_path: Path) -> None:
+    log = ring(2)
+    write_carmen(log, tmp_path / "red.clf")
+    write_tum(log.times, log.poses, tmp_path / "red.tum")
+    session = tmp_path / "team.yaml"
+    session.write_text("robots: {red: {log: red.clf}}\ntruth: {red: red.tum}\n")
+    file = tmp_path / "small.yaml"
+    file.write_text(to_yaml(small()))
+    done = call("compare", session, "--out", tmp_path / "out", "--config", file, "--seed", 3, "--threads", 1)
+    assert done.returncode == 0, done.stderr
+    assert "tree only" in done.stdout
+    assert "ATE RMSE, m" in done.stdout
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "comparison.md", "comparison.json", "fig3-red.png", "fig4.png", "fig5.png", "fig6.png",
+    }  # fmt: skip
+    ways = {way["name"]: way for way in json.loads((tmp_path / "out" / "comparison.json").read_text())["ways"]}
+    assert ways["on line"]["ate"] < 0.05
+    quiet = call("compare", session, "--out", tmp_path / "out", "--config", file, "--quiet")
+    assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
+
+
+@pytest.mark.slow
+def test_the_demo_compared(tmp_path: Path) -> None:
+    done = call("compare", DEMO / "team.yaml", "--out", tmp_path, "--quiet")
+    assert (done.returncode, done.stderr) == (0, "")
+    figures = {path.name for path in tmp_path.glob("*.png")}
+    assert figures == {f"fig{name}.png" for name in ("3-red", "3-blue", "3-green", "4", "5", "6")}
+    ways = {way["name"]: way for way in json.loads((tmp_path / "comparison.json").read_text())["ways"]}
+    assert max(ways["on line"]["ate"], ways["off-line EM"]["ate"]) < 0.5 * ways["tree only"]["ate"]
+    assert ways["on line"]["ate"] < 0.03
+    assert ways["on line"]["crispness"]["disagreement"] < ways["tree only"]["crispness"]["disagreement"]
 
 
 def test_a_wrong_use_is_exit_code_2() -> None:

@@ -1,15 +1,21 @@
 """The metrics against worked examples, scipy and GTSAM, and their files against mistakes."""
 
+import io
 import json
+import re
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
 import numpy.typing as npt
 import pytest
+from rich.console import Console
 
+from factors import Edge
 from frontend import se2
 from mrtm.evaluation import (
+    Evaluation,
     EvaluationError,
     Relations,
     TimedPoses,
@@ -26,7 +32,7 @@ from mrtm.evaluation import (
 from mrtm.output.export import export
 from mrtm.output.report import evaluation_report
 from tests.mrtm.sample_run import sample_run
-from tools.fuzzing.seeds import RUNS
+from tools.fuzzing.seeds import RUNS, TRAJECTORIES
 
 Array = npt.NDArray[np.float64]
 
@@ -272,12 +278,99 @@ def test_a_run_directory_is_evaluated(tmp_path: Path) -> None:
     fates = [fate for fate in sample_run().edges if fate.edge.kind == "loop" and fate.fate == "accepted"]
     poses = sample_run().vertex_poses
     edge = fates[0].edge
+    assert isinstance(edge, Edge)
     error = gtsam.Pose2.Logmap(poses[edge.tail].between(poses[edge.head]).between(edge.measurement))
     expected = error @ np.linalg.inv(edge.covariance) @ error / 3
     assert evaluation.edges["loop"].nees.mean == pytest.approx(expected, rel=1e-4)
     written = json.loads((out / "evaluation.json").read_text())
     assert written["relations"]["count"] == 2
     assert len(evaluation_report(evaluation)) == 3
+
+
+TEAM: dict[str, Any] = {
+    "first_meeting": 94.0,
+    "common_frame": 101.5,
+    "meetings": [
+        {"time": 94.0, "robots": ["red", "blue"], "bytes": {"edge": 100, "map": 2000}, "verdict": "waiting"},
+        {"time": 101.5, "robots": ["blue", "red"], "bytes": {"edge": 40}, "verdict": "accepted"},
+        {"time": 102.5, "robots": ["red", "green"], "bytes": {"digest": 60, "map": 0}, "verdict": "accepted"},
+    ],
+}
+
+
+def write_team(out: Path, **changes: object) -> None:
+    """A run with meetings; their reasons are not what is measured."""
+    content = json.loads(RUNS[0]) | {"team": TEAM | changes}
+    for meeting in content["team"]["meetings"]:
+        meeting["reason"] = ""
+    (out / "trajectory").mkdir(exist_ok=True)
+    (out / "trajectory" / "robot.tum").write_bytes(TRAJECTORIES[0])
+    (out / "run.json").write_text(json.dumps(content))
+
+
+def printed(evaluation: Evaluation) -> str:
+    console = Console(width=120, file=io.StringIO())
+    with console.capture() as capture:
+        for part in evaluation_report(evaluation):
+            console.print(part)
+    return capture.get()
+
+
+def test_meetings_are_summed_up(tmp_path: Path) -> None:
+    write_team(tmp_path)
+    evaluation = evaluate_output(tmp_path)
+    found = evaluation.meetings
+    assert found is not None
+    assert found.verdicts == {"waiting": 1, "accepted": 2}
+    assert (found.first_meeting, found.to_common_frame) == (94.0, 7.5)
+    assert {kind: traffic.total for kind, traffic in found.traffic_by_kind.items()} == {
+        "map": 2000,
+        "edge": 140,
+        "digest": 60,
+    }
+    edge = found.traffic_by_kind["edge"].per_meeting
+    assert edge.mean == pytest.approx(140 / 3)
+    assert (edge.median, edge.max) == (40.0, 100.0)
+    assert found.traffic.total == 2200
+    assert (found.traffic.per_meeting.median, found.traffic.per_meeting.max) == (60.0, 2100.0)
+    assert json.loads((tmp_path / "evaluation.json").read_text())["meetings"]["to_common_frame"] == 7.5
+    said = printed(evaluation)
+    assert "3 meetings (1 waiting, 2 accepted), the first at 94.0 s" in said
+    assert "common frame 7.5 s of team time after it" in said
+    assert re.search(r"map +│ +667 │ +0 │ +2,000 │ +2,000", said)
+    assert re.search(r"together +│ +733 │ +60 │ +2,100 │ +2,200", said)
+
+
+def test_meetings_without_a_common_frame_and_no_meetings(tmp_path: Path) -> None:
+    write_team(tmp_path, common_frame=None)
+    assert "no common frame" in printed(evaluate_output(tmp_path))
+    write_team(tmp_path, first_meeting=None, common_frame=None, meetings=[])
+    evaluation = evaluate_output(tmp_path)
+    assert evaluation.meetings is not None
+    assert evaluation.meetings.traffic.total == 0
+    assert printed(evaluation).strip() == "no two robots met"
+    assert json.loads((tmp_path / "evaluation.json").read_text())["meetings"]["verdicts"] == {}
+    content = json.loads(RUNS[0])
+    del content["team"]
+    (tmp_path / "run.json").write_text(json.dumps(content))
+    assert evaluate_output(tmp_path).meetings is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"first_meeting": "soon"},
+        {"common_frame": float("nan")},
+        {"meetings": [{}]},
+        {"meetings": [TEAM["meetings"][0] | {"bytes": {"edge": -1}}]},
+        {"meetings": [TEAM["meetings"][0] | {"robots": ["red"]}]},
+        {"meetings": [TEAM["meetings"][0] | {"verdict": "perhaps"}]},
+    ],
+)
+def test_damaged_meetings_are_named(tmp_path: Path, change: dict[str, object]) -> None:
+    write_team(tmp_path, **change)
+    with pytest.raises(EvaluationError, match=r"run\.json: not what a run writes \(team\..*\); run again"):
+        evaluate_output(tmp_path)
 
 
 def test_truth_must_name_robots_of_the_run(tmp_path: Path) -> None:

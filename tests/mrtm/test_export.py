@@ -52,7 +52,8 @@ def test_run_json_tells_the_whole_story(out: Path) -> None:
     assert run["edges"][0]["chi2"] is None  # JSON has no NaN
     for entry, fate in zip(run["edges"], result.edges, strict=True):
         edge = Edge.from_dict({k: v for k, v in entry.items() if k not in ("fate", "reason", "chi2")})
-        assert edge.measurement.equals(fate.edge.measurement, 1e-12)
+        assert fate.edge.estimate is not None
+        assert edge.measurement.equals(fate.edge.estimate.pose, 1e-12)
         np.testing.assert_array_equal(edge.covariance, fate.edge.covariance)
     vertex = run["vertices"][0]
     assert vertex["first_scan"]["time"] == 100.0
@@ -83,10 +84,11 @@ def test_gtsam_reads_the_graph_and_keeps_its_errors(out: Path) -> None:
     for key, vertex in enumerate(order):
         assert values.atPose2(key).equals(result.vertex_poses[vertex], 1e-7)
     for i, edge in enumerate(accepted):
+        assert edge.estimate is not None
         factor = gtsam.BetweenFactorPose2(
             order.index(edge.tail),
             order.index(edge.head),
-            edge.measurement,
+            edge.estimate.pose,
             gtsam.noiseModel.Gaussian.Covariance(edge.covariance),
         )
         assert graph.at(i).error(values) == pytest.approx(factor.error(values), rel=1e-4)

@@ -15,8 +15,8 @@ from frontend import se2
 from frontend.grid import Maps
 from frontend.local_slam import LocalSlam
 from frontend.parameters import FilterParameters
-from frontend.rbpf import Step
 from frontend.records import FloatArray
+from frontend.tracking import Step
 from mrtm.config import TopologyParameters
 from mrtm.robot import reentry
 from mrtm.robot.poses import array_of, exactly, innovation, pose_of

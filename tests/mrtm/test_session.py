@@ -19,7 +19,7 @@ from frontend.errors import LogError
 from mrtm.config import Config, load_config
 from mrtm.evaluation import evaluate_output, read_tum
 from mrtm.result import RunResult
-from mrtm.session import run_log
+from mrtm.session import run_session
 from tests.mrtm.small_logs import edge_errors, errors, false_edges, mapped, office_ring, poses, ring, room, small
 from tools.simulation import LMS200, LMS200_HALF_DEGREE, LaserModel, SimulatedLog, write_carmen, write_tum
 
@@ -41,7 +41,7 @@ def write(tmp_path: Path) -> Write:
 
 
 def run(path: Path, out: Path, config: Config | None = None) -> RunResult:
-    return run_log(path, out, config or small(), lambda fraction, doing: None)
+    return run_session(path, out, config or small(), lambda fraction, doing: None)
 
 
 def contents(out: Path) -> dict[str, bytes]:
@@ -71,16 +71,17 @@ def check_output(out: Path, result: RunResult) -> None:
     ]
     assert [event["kind"] for event in record["events"]] == [event.kind for event in result.events]
 
-    ((robot, trajectory),) = result.trajectories.items()
-    written = read_tum(out / "trajectory" / f"{robot}.tum")
-    np.testing.assert_allclose(written.times, trajectory.times, atol=1e-6)
-    np.testing.assert_allclose(written.poses[:, :2], trajectory.poses[:, :2], atol=1e-6)
+    for robot, trajectory in result.trajectories.items():
+        written = read_tum(out / "trajectory" / f"{robot}.tum")
+        np.testing.assert_allclose(written.times, trajectory.times, atol=1e-6)
+        np.testing.assert_allclose(written.poses[:, :2], trajectory.poses[:, :2], atol=1e-6)
 
     image = np.asarray(Image.open(out / "map.pgm"))
     meta = yaml.safe_load((out / "map.yaml").read_text())
     assert meta["image"] == "map.pgm"
     assert {205, 254} <= set(np.unique(image).tolist())
-    column, row = ((trajectory.poses[:, :2] - np.array(meta["origin"][:2])) / meta["resolution"]).astype(int).T
+    positions = np.concatenate([trajectory.poses[:, :2] for trajectory in result.trajectories.values()])
+    column, row = ((positions - np.array(meta["origin"][:2])) / meta["resolution"]).astype(int).T
     assert (image[image.shape[0] - 1 - row, column] == 254).mean() > 0.98  # the robot drove where the map is free
     assert Image.open(out / "map.png").size[0] > 300
 
@@ -92,25 +93,54 @@ def check_output(out: Path, result: RunResult) -> None:
     assert len(list((out / "local_maps").iterdir())) == len(result.local_maps)
 
 
-def test_the_committed_demo_log_is_mapped_well(tmp_path: Path) -> None:
-    """Few particles, else as it comes; what ``make demo`` does with all of them."""
-    result = run(DEMO / "demo.clf.gz", tmp_path, load_config(options=["frontend.particles=10"]))
-    assert list(result.trajectories) == ["demo"]
-    assert result.counts["scans"] == len(read_tum(DEMO / "truth.tum").times)
-    assert result.counts["vertices"] >= 3
-    assert any(fate.edge.kind == "loop" and fate.fate == "accepted" for fate in result.edges)
-    check_output(tmp_path, result)
-    (ate,) = evaluate_output(tmp_path, truth=DEMO / "truth.tum").ate
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunResult]:
+    """The committed team, few particles, else as it comes; what ``make demo`` does with all of them."""
+    out = tmp_path_factory.mktemp("demo")
+    return out, run(DEMO / "team.yaml", out, load_config(options=["frontend.particles=10"]))
+
+
+def test_the_committed_demo_team_comes_into_one_map(demo: tuple[Path, RunResult]) -> None:
+    out, result = demo
+    check_output(out, result)
+    assert list(result.trajectories) == ["red", "blue", "green"]
+    (component,) = result.components
+    assert {vertex.robot for vertex in component} == {"red", "blue", "green"}
+    kinds = {str(fate.edge.kind) for fate in result.edges if fate.fate == "accepted"}
+    assert kinds >= {"inter_vertex", "loop", "fusing"}
+    evaluation = evaluate_output(out, truth={robot: DEMO / "truth" / f"{robot}.tum" for robot in result.trajectories})
+    (ate,) = evaluation.ate
     assert ate.translation.rmse < 0.1
     assert ate.translation.max < 0.5
 
 
+def test_the_story_of_the_demo_team_is_told(demo: tuple[Path, RunResult]) -> None:
+    _, result = demo
+    team = result.team
+    assert team is not None
+    assert team.first_meeting is not None
+    assert team.common_frame is not None
+    assert team.first_meeting <= team.common_frame < team.first_meeting + 60
+    assert [meeting.time for meeting in team.meetings] == sorted(meeting.time for meeting in team.meetings)
+    assert all(meeting.reason and sum(meeting.bytes.values()) > 0 for meeting in team.meetings)
+    assert {meeting.verdict for meeting in team.meetings} >= {"accepted"}
+    lines = len((DEMO / "sightings.csv").read_text().splitlines()) - 1
+    assert len(team.sightings) == lines
+    assert all(sighting.fate == "accepted" for sighting in team.sightings)  # none of them is false
+    own = {robot: sum(v.robot == robot for v in result.vertex_poses) for robot in result.trajectories}
+    for robot, known in team.known.items():
+        assert known[robot] == own[robot]
+        assert all(known[other] <= own[other] for other in known)
+    assert any(len(known) == 3 for known in team.known.values())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_demo_log_is_mapped_well_with_every_seed(tmp_path: Path, seed: int) -> None:
-    run(DEMO / "demo.clf.gz", tmp_path, load_config(options=[f"seed={seed}"]))
-    (ate,) = evaluate_output(tmp_path, truth=DEMO / "truth.tum").ate
-    assert ate.translation.rmse < 0.05
+def test_the_demo_team_is_mapped_well_with_every_seed(tmp_path: Path, seed: int) -> None:
+    run(DEMO / "team.yaml", tmp_path, load_config(options=[f"seed={seed}"]))
+    truth = {robot: DEMO / "truth" / f"{robot}.tum" for robot in ("red", "blue", "green")}
+    (ate,) = evaluate_output(tmp_path, truth=truth).ate
+    assert ate.translation.rmse < 0.1
 
 
 def test_the_same_seed_leaves_the_same_bytes_with_any_number_of_threads(write: Write, tmp_path: Path) -> None:
@@ -132,9 +162,9 @@ def test_the_same_seed_leaves_the_same_bytes_with_any_number_of_threads(write: W
 
 
 @pytest.mark.slow
-def test_the_demo_log_leaves_the_same_bytes_twice(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        run(DEMO / "demo.clf.gz", tmp_path / name, load_config())
+def test_the_demo_team_leaves_the_same_bytes_on_any_number_of_cores(tmp_path: Path) -> None:
+    for name, cores in (("a", 1), ("b", 3)):
+        run_session(DEMO / "team.yaml", tmp_path / name, small(), lambda fraction, doing: None, cores)
     first, second = contents(tmp_path / "a"), contents(tmp_path / "b")
     assert set(first) == set(second)
     assert [name for name in first if first[name] != second[name]] == []

@@ -72,7 +72,7 @@ def places() -> list[Path]:
 
 def find_logs(directories: Sequence[Path]) -> dict[str, BenchLog]:
     """The benchmark's logs that are at hand, by name; the demo log always is."""
-    found = {"demo": BenchLog("demo", ROOT / "data/demo/demo.clf.gz", reference=ROOT / "data/demo/truth.tum")}
+    found = {"demo": BenchLog("demo", ROOT / "data/demo/red.clf.gz", reference=ROOT / "data/demo/truth/red.tum")}
     for name, stem in (("intel", "intel"), ("aces", "aces"), ("csail", "mit-csail")):
         for directory in directories:
             logs = sorted(directory.glob(f"{stem}.clf*"))

@@ -10,7 +10,9 @@ from random import Random
 
 import atheris
 
-with atheris.instrument_imports(include=["frontend.readers", "mrtm.config", "mrtm.plain_yaml", "mrtm.evaluation"]):
+with atheris.instrument_imports(
+    include=["frontend.readers", "mrtm.config", "mrtm.plain_yaml", "mrtm.evaluation", "mrtm.team"]
+):
     from tools.fuzzing.targets import holds, targets
 
 from tools.fuzzing.mutate import LARGEST, mutate

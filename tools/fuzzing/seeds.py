@@ -137,6 +137,19 @@ OPTIONS = [
     b"frontend={sigma: 1e-2}",
     b"frontend.motion.xy_floor=.01",
 ]
+SESSIONS = [
+    b"# a team\nrobots:\n  red:  {log: input, from: 0, to: 900}\n  blue: {log: input, from: 900, start: 5.5}\n"
+    b"sightings: seen.csv\nrelations: true.relations\ntruth: {red: red.tum}\n",
+    b'robots:\n  "red":\n    log: ./input\n    to: 1e3\n',
+]
+SIGHTINGS = [
+    b"time,observer,observed,range,bearing,heading,sigma_range,sigma_bearing,sigma_heading\n"
+    b"94.0,red,blue,5.7,0.2,-2.1,0.05,0.02,0.05\n\n95.5,blue,red,5.2,-0.8,,.05,2e-2,\n",
+    b"observed,observer,time,sigma_heading,sigma_bearing,sigma_range,heading,bearing,range\r\n"
+    b' blue , red ,0,0.05,0.02,0.05,-3.1,6.2,"1"\r\n',
+]
+"""Of the robots red and blue."""
+
 RELATIONS = [
     b"100.1 101.2 0.1 -0.2 0 0 0 1.5\n# comment\n101.2 102.3 1 2 0 0 0 -3.1\n",
     b"".join(b"%d %d 1.5 0.25 0.0 0.0 0.0 0.1\n" % (time, time + 1) for time in range(20)),
@@ -174,6 +187,19 @@ RUNS = [
                     "covariance": [[0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.001]],
                 }
             ],
+            "team": {
+                "first_meeting": 2.5,
+                "common_frame": 3.0,
+                "meetings": [
+                    {
+                        "time": 2.5,
+                        "robots": ["robot", "other"],
+                        "bytes": {"edge": 100, "map": 2000},
+                        "verdict": "accepted",
+                        "reason": "",
+                    }
+                ],
+            },
         },
         indent=1,
     ).encode()

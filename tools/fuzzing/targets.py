@@ -1,7 +1,7 @@
 """What reads files, and what must hold of whatever it makes of any input."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,6 +17,8 @@ from mrtm.evaluation import evaluate_output
 from mrtm.evaluation.relations import read_relations
 from mrtm.evaluation.trajectory import read_tum
 from mrtm.info import describe, log_info
+from mrtm.team.session_file import read_session
+from mrtm.team.sightings_file import TimedSighting, read_sightings
 from tools.fuzzing import seeds
 
 ERRORS = (FrontendError, MrtmError)
@@ -48,6 +50,8 @@ def targets() -> list[Target]:
         *logs,
         Target("configuration", seeds.CONFIGURATIONS, _read_configuration),
         Target("option", seeds.OPTIONS, _read_option),
+        Target("session", seeds.SESSIONS, _read_session),
+        Target("sightings", seeds.SIGHTINGS, _read_sightings),
         Target("relations", seeds.RELATIONS, _read_relations),
         Target("trajectory", seeds.TRAJECTORIES, _read_trajectory),
         Target("run", seeds.RUNS, _read_run),
@@ -106,6 +110,36 @@ def _reads_back(file: Path | None, options: list[str]) -> None:
     config = load_config(file, options=options)
     values = [line.partition("#")[0].strip() for line in to_yaml(config).splitlines()]
     _must(len(values) > 10 and all(values), "the configuration does not print")
+
+
+def _read_session(file: Path) -> None:
+    """The file as a team's session, beside good sightings; its logs are not read."""
+    with TemporaryDirectory(dir=file.parent) as place:
+        Path(place, "seen.csv").write_bytes(seeds.SIGHTINGS[0])
+        path = Path(place, "team.yaml")
+        path.write_bytes(file.read_bytes())
+        session = read_session(path)
+    names = [member.name for member in session.members]
+    _must(0 < len(names) == len({name.casefold() for name in names}), f"the robots are {names}")
+    for member in session.members:
+        _must(Path(member.name).name == member.name and member.name.isprintable(), f"the name {member.name!r}")
+        _must(0.0 <= member.begin < member.end and math.isfinite(member.start), f"{member}")
+    _must(set(session.truth) <= set(names), "truth of a stranger")
+    _check_sightings(session.sightings, names)
+
+
+def _read_sightings(file: Path) -> None:
+    _check_sightings(read_sightings(file, ("red", "blue")), ["red", "blue"])
+
+
+def _check_sightings(sightings: Sequence[TimedSighting], robots: list[str]) -> None:
+    times = [sighting.time for sighting in sightings]
+    _must(times == sorted(times) and all(map(math.isfinite, times)), "times not in order")
+    for sighting in sightings:
+        _must({sighting.observer, sighting.observed} <= set(robots), f"{sighting} of a stranger")
+        _must(sighting.observer != sighting.observed, f"{sighting} of oneself")
+        known = sighting.measurement.relative_pose()
+        _must(known is None or bool(np.all(np.linalg.eigvalsh(known.covariance) > 0.0)), f"{sighting}: covariance")
 
 
 def _read_relations(file: Path) -> None:

@@ -168,10 +168,10 @@ def samples_of(result: RunResult, truth: FloatArray, plan: str, seed: int) -> li
     samples = []
     for fate in result.edges:
         edge = fate.edge
-        if fate.fate != "refused":
+        if fate.fate != "refused" and edge.estimate is not None:
             first = edge.kind is EdgeKind.LOOP and edge.version == 0 and fate.fate == "replaced"
             kind = ENTERING if first else str(edge.kind)
-            samples.append(sample(kind, str(edge), edge.tail, edge.head, edge.measurement, edge.covariance))
+            samples.append(sample(kind, str(edge), edge.tail, edge.head, *edge.estimate))
     poses = result.vertex_poses
     for root, *others in result.components:
         for v in others:

@@ -8,7 +8,9 @@ import numpy.typing as npt
 
 from frontend.records import FloatArray, Laser
 from tools.simulation.poses import compose
-from tools.simulation.raycast import cast
+from tools.simulation.raycast import cast, shade
+
+BODY = 0.25  # radius of a robot, as another robot's laser sees it, metres
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,11 @@ LMS200_HALF_DEGREE = LaserModel(beams=361, step=math.pi / 360)
 
 
 def measure(
-    laser: LaserModel, segments: FloatArray, poses: FloatArray, rng: np.random.Generator
+    laser: LaserModel,
+    segments: FloatArray,
+    poses: FloatArray,
+    rng: np.random.Generator,
+    others: FloatArray | None = None,
 ) -> npt.NDArray[np.float32]:
     """What the laser reports from each robot pose.
 
@@ -76,12 +82,13 @@ def measure(
         segments: (S, 4) everything it can hit, in the plan's frame.
         poses: (N, 3) plan_T_robot.
         rng: noise.
+        others: (N, K, 2) where the other robots are at the time of each pose, in the plan's frame.
 
     Returns:
         (N, B) metres, inf where nothing was seen.
     """
     at = compose(poses, np.array(laser.mount))
-    ranges = _echoes(laser, segments, at, rng)
+    ranges = _echoes(laser, segments, at, rng, np.empty((len(at), 0, 2)) if others is None else others)
     ranges += laser.sigma * rng.standard_normal(ranges.shape)
     if laser.resolution > 0:
         ranges = np.round(ranges / laser.resolution) * laser.resolution
@@ -92,11 +99,18 @@ def measure(
     return ranges.astype(np.float32)
 
 
-def _echoes(laser: LaserModel, segments: FloatArray, at: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _echoes(
+    laser: LaserModel, segments: FloatArray, at: FloatArray, rng: np.random.Generator, others: FloatArray
+) -> FloatArray:
     """Ranges without noise; some beams that straddle an edge report a range between its two sides."""
-    middle = cast(segments, at, laser.first, laser.step, laser.beams)
+
+    def exact(side: float) -> FloatArray:
+        ranges = cast(segments, at, laser.first + side, laser.step, laser.beams, laser.max_range)
+        shade(ranges, others, BODY, at, laser.first + side, laser.step)
+        return ranges
+
     half = laser.divergence / 2
-    left, right = (cast(segments, at, laser.first + side, laser.step, laser.beams) for side in (half, -half))
+    middle, left, right = exact(0.0), exact(half), exact(-half)
     near, far = np.minimum(left, right), np.maximum(left, right)
     fraction, chance = rng.random(near.shape), rng.random(near.shape)
     # With nothing behind the edge there is only one echo, hence nothing to mix.

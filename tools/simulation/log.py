@@ -11,6 +11,7 @@ from tools.simulation.driving import Driving, drive
 from tools.simulation.laser import LMS200, LaserModel, measure
 from tools.simulation.odometry import OdometryNoise, dead_reckon
 from tools.simulation.plan import FloorPlan
+from tools.simulation.poses import between, compose, exponential, logarithm
 
 WHEEL_RATE = 20.0  # wheel readings a second, at least
 CHUNK = 1000  # scans computed at a time
@@ -96,13 +97,94 @@ def stream(
     Raises:
         SimulationError: the route is unknown or cannot be driven.
     """
-    path_rng, wheel_rng, laser_rng = (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3))
-    steps = max(1, int(np.ceil(WHEEL_RATE / laser.rate)))
-    times, poses = drive(plan, route, driving, laser.rate * steps, path_rng, laps, hours)
-    odometry = dead_reckon(times, poses, noise, wheel_rng)
-    times = np.round(start_time + times[::steps], 6)
-    poses, odometry = poses[::steps].copy(), odometry[::steps].copy()
+    journey = travel(plan, route, laser.rate, noise, seed, driving=driving, laps=laps, hours=hours)
+    yield from record(plan, journey, laser, seed, start_time=start_time)
+
+
+@dataclass(frozen=True, slots=True)
+class Journey:
+    """Where a robot is and what its wheels say, M times, evenly spaced and dense.
+
+    Attributes:
+        times: (M,) seconds from 0.
+        poses: (M, 3) plan_T_robot: the truth.
+        odometry: (M, 3) odom_T_robot, the first at the origin.
+        every: each how-manieth of them comes with a scan.
+    """
+
+    times: FloatArray
+    poses: FloatArray
+    odometry: FloatArray
+    every: int
+
+    @property
+    def scan_times(self) -> FloatArray:
+        """(N,) seconds from 0."""
+        return self.times[:: self.every]
+
+    def until(self, seconds: float) -> "Journey":
+        """Its beginning, with one scan at least."""
+        count = max(1, int(np.searchsorted(self.times, seconds, side="right")))
+        return Journey(self.times[:count], self.poses[:count], self.odometry[:count], self.every)
+
+    def at(self, times: FloatArray) -> FloatArray:
+        """(T, 3) plan_T_robot at these times; the robot stands at its ends before and after."""
+        clipped = np.clip(times, 0.0, self.times[-1])
+        before = np.clip(np.searchsorted(self.times, clipped, side="right") - 1, 0, max(0, len(self.times) - 2))
+        after = np.minimum(before + 1, len(self.times) - 1)
+        spans = self.times[after] - self.times[before]
+        fraction = np.divide(clipped - self.times[before], spans, out=np.zeros(len(clipped)), where=spans > 0)
+        motion = logarithm(between(self.poses[before], self.poses[after]))
+        return compose(self.poses[before], exponential(motion * fraction[:, None]))
+
+
+def travel(
+    plan: FloorPlan,
+    route: str,
+    rate: float,
+    noise: OdometryNoise,
+    seed: int,
+    *,
+    driving: Driving = Driving(),  # noqa: B008 (frozen)
+    laps: int = 1,
+    hours: float = 0.0,
+) -> Journey:
+    """Drives the route with ``rate`` scans a second; other arguments and errors as in ``stream``."""
+    path_rng, wheel_rng, _ = _generators(seed)
+    steps = max(1, int(np.ceil(WHEEL_RATE / rate)))
+    times, poses = drive(plan, route, driving, rate * steps, path_rng, laps, hours)
+    return Journey(times, poses, dead_reckon(times, poses, noise, wheel_rng), steps)
+
+
+def record(
+    plan: FloorPlan,
+    journey: Journey,
+    laser: LaserModel,
+    seed: int,
+    *,
+    start_time: float,
+    others: FloatArray | None = None,
+) -> Iterator[SimulatedLog]:
+    """What the laser sees on the journey, piece by piece.
+
+    Args:
+        plan: the building.
+        journey: with the laser's rate.
+        laser: the scanner.
+        seed: that of the journey.
+        start_time: seconds, the log's clock at the first scan.
+        others: (N, K, 2) where other robots are at the time of each scan, in the plan's frame.
+    """
+    laser_rng = _generators(seed)[2]
+    times = np.round(start_time + journey.scan_times, 6)
+    poses, odometry = (values[:: journey.every].copy() for values in (journey.poses, journey.odometry))
     for begin in range(0, len(times), CHUNK):
         chunk = slice(begin, begin + CHUNK)
-        ranges = measure(laser, plan.segments, poses[chunk], laser_rng)
+        around = None if others is None else others[chunk]
+        ranges = measure(laser, plan.segments, poses[chunk], laser_rng, around)
         yield SimulatedLog(times[chunk], odometry[chunk], poses[chunk], ranges, laser)
+
+
+def _generators(seed: int) -> list[np.random.Generator]:
+    """Of the path, the wheels and the laser."""
+    return [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3)]

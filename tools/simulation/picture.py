@@ -10,6 +10,8 @@ from frontend.records import FloatArray
 from tools.simulation.log import SimulatedLog
 from tools.simulation.plan import FloorPlan
 from tools.simulation.poses import compose
+from tools.simulation.sightings import SimulatedSighting
+from tools.simulation.team import COLOURS, SimulatedTeam
 
 
 def draw(plan: FloorPlan, log: SimulatedLog, path: Path, scan: int) -> None:
@@ -26,6 +28,29 @@ def draw(plan: FloorPlan, log: SimulatedLog, path: Path, scan: int) -> None:
     low, high = walls.min(axis=(0, 1)) - 1, walls.max(axis=(0, 1)) + 1
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
+    figure.savefig(path, dpi=110)
+
+
+def draw_team(team: SimulatedTeam, sightings: list[SimulatedSighting], path: Path) -> None:
+    """A PNG: the plan, every robot's true path and start, and who believes to see whom from where."""
+    plan = team.plan
+    figure = Figure(figsize=(12, 8), layout="constrained")
+    axes = figure.add_subplot(aspect="equal", title=f"{plan.name}: {len(team.robots)} robots", xlabel="m", ylabel="m")
+    axes.add_collection(LineCollection(list(plan.segments.reshape(-1, 2, 2)), colors="black", linewidths=0.8))
+    colours = {robot.name: robot.name if robot.name in COLOURS else f"C{i}" for i, robot in enumerate(team.robots)}
+    for robot in team.robots:
+        axes.plot(*robot.journey.poses[:, :2].T, color=colours[robot.name], linewidth=1, label=robot.name)
+        axes.plot(*robot.journey.poses[0, :2], "o", color=colours[robot.name])
+    robots = {robot.name: robot for robot in team.robots}
+    for sighting in sightings:
+        eye = robots[sighting.observer].at(np.array([sighting.time]))[0]
+        angle = eye[2] + sighting.bearing
+        seen = eye[:2] + sighting.range * np.array((np.cos(angle), np.sin(angle)))
+        axes.plot(*np.stack((eye[:2], seen)).T, color=colours[sighting.observed], linewidth=0.4)
+    low, high = plan.segments.reshape(-1, 2).min(axis=0) - 1, plan.segments.reshape(-1, 2).max(axis=0) + 1
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    if len(team.robots) <= len(COLOURS):
+        axes.legend(loc="upper left", bbox_to_anchor=(1, 1))
     figure.savefig(path, dpi=110)
 
 

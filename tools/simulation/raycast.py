@@ -1,4 +1,4 @@
-"""Where beams meet wall segments, and how near a robot comes to them. Kernels in numba."""
+"""Where beams meet wall segments and robots, and how near a robot comes to them. Kernels in numba."""
 
 import numpy as np
 from numba import njit
@@ -7,7 +7,9 @@ from frontend.records import FloatArray
 
 
 @njit(cache=True)
-def cast(segments: FloatArray, poses: FloatArray, first: float, step: float, beams: int) -> FloatArray:
+def cast(
+    segments: FloatArray, poses: FloatArray, first: float, step: float, beams: int, reach: float = np.inf
+) -> FloatArray:
     """Distances from each laser pose to the nearest segment along evenly spaced bearings.
 
     A segment is only tested against the beams inside the angle that it subtends, so the cost of a scan is
@@ -19,9 +21,10 @@ def cast(segments: FloatArray, poses: FloatArray, first: float, step: float, bea
         first: bearing of beam 0 in the laser frame, radians.
         step: radians from a beam to the next, above 0.
         beams: number of beams.
+        reach: metres, beyond which it does not matter what a beam meets.
 
     Returns:
-        (N, beams) metres, inf where a beam meets nothing.
+        (N, beams) metres, inf where a beam meets nothing; beyond ``reach`` it may miss what is there.
     """
     ranges = np.full((poses.shape[0], beams), np.inf)
     cosines = np.cos(first + step * np.arange(beams))
@@ -32,9 +35,11 @@ def cast(segments: FloatArray, poses: FloatArray, first: float, step: float, bea
         c, s = np.cos(theta), np.sin(theta)
         for k in range(segments.shape[0]):
             dx, dy = segments[k, 0] - x, segments[k, 1] - y
+            ux, uy = segments[k, 2] - x, segments[k, 3] - y
+            if min(dx, ux) > reach or max(dx, ux) < -reach or min(dy, uy) > reach or max(dy, uy) < -reach:
+                continue
             ax, ay = c * dx + s * dy, c * dy - s * dx
-            dx, dy = segments[k, 2] - x, segments[k, 3] - y
-            bx, by = c * dx + s * dy, c * dy - s * dx
+            bx, by = c * ux + s * uy, c * uy - s * ux
             ex, ey = bx - ax, by - ay
             cross = ax * ey - ay * ex
             start, end = np.arctan2(ay, ax), np.arctan2(by, bx)
@@ -59,6 +64,42 @@ def cast(segments: FloatArray, poses: FloatArray, first: float, step: float, bea
                 start_in_turn += turn
                 end_in_turn += turn
     return ranges
+
+
+@njit(cache=True)
+def shade(ranges: FloatArray, discs: FloatArray, radius: float, poses: FloatArray, first: float, step: float) -> None:
+    """Shortens, in place, the beams that meet a disc; a disc is somewhere else for each pose.
+
+    A disc whose centre is nearer than twice the radius is passed over: two robots there would be inside each other.
+
+    Args:
+        ranges: (N, B) metres, as ``cast`` returns them.
+        discs: (N, K, 2) centres, in the frame of the poses.
+        radius: of the discs, metres.
+        poses: (N, 3) laser poses.
+        first: bearing of beam 0 in the laser frame, radians.
+        step: radians from a beam to the next, above 0.
+    """
+    turn = 2.0 * np.pi
+    beams = ranges.shape[1]
+    for n in range(poses.shape[0]):
+        for k in range(discs.shape[1]):
+            dx, dy = discs[n, k, 0] - poses[n, 0], discs[n, k, 1] - poses[n, 1]
+            away = np.hypot(dx, dy)
+            if away < 2.0 * radius:
+                continue
+            half = np.arcsin(radius / away)
+            bearing = np.arctan2(dy, dx) - poses[n, 2]
+            bearing += turn * np.ceil((first - half - bearing) / turn)  # the first turn in which it ends after beam 0
+            while bearing - half <= first + step * (beams - 1):
+                low = max(0, int(np.ceil((bearing - half - first) / step)))
+                high = min(beams - 1, int(np.floor((bearing + half - first) / step)))
+                for b in range(low, high + 1):
+                    off = first + step * b - bearing
+                    aside = away * np.sin(off)
+                    distance = away * np.cos(off) - np.sqrt(max(0.0, radius * radius - aside * aside))
+                    ranges[n, b] = min(ranges[n, b], distance)
+                bearing += turn
 
 
 @njit(cache=True)

@@ -1,0 +1,134 @@
+"""Keeps the alignments of a joint map up to date (M13, on line): which pairs of maps, when again, with what outcome.
+
+An alignment is tried when two maps of a component may overlap. It is tried again when one of the maps has changed, or
+when the estimate has moved so far that the old answer was to another question.
+"""
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
+from mrtm.joint.alignment import Alignment, align
+from mrtm.joint.candidates import pairs
+from mrtm.joint.graph import JointGraph
+from mrtm.joint.surface import Surface
+
+Pair = tuple[VertexId, VertexId]
+
+MOVED = 4.0
+"""Squared Mahalanobis distance, as the first guess saw it, beyond which a new guess is another question."""
+
+CONTRADICTED = 16.27
+"""chi2 of 3 degrees of freedom, 99.9 %: an alignment so far from the joint estimate is taken back."""
+
+SURER = 4.0
+"""Times the volume of the first guess's covariance over the new one's for a refused pair to be worth another look."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """An alignment that was tried.
+
+    Attributes:
+        maps: the two as they were.
+        guess: a_T_b as it was known.
+        found: what came of it; None if nothing of the maps could meet.
+        edge: if it is believed.
+        refusal: why not, in words; empty if it is.
+    """
+
+    maps: tuple[Surface, Surface]
+    guess: UncertainPose
+    found: Alignment | None
+    edge: Edge | None
+    refusal: str
+
+
+class Aligner:
+    """The alignments of one joint map."""
+
+    def __init__(self) -> None:
+        self.attempts: dict[Pair, Attempt] = {}
+        self._versions: dict[Pair, int] = {}
+
+    def edges(self) -> list[Edge]:
+        """Those believed."""
+        return [a.edge for a in self.attempts.values() if a.edge is not None]
+
+    def keep_within(self, groups: Iterable[Collection[str]]) -> None:
+        """Forget alignments between robots that are not, or no longer, in one of the ``groups``.
+
+        The guess was wrong then; if the robots come together again it is to another question.
+        """
+        group = {robot: number for number, robots in enumerate(groups) for robot in robots}
+        self.attempts = {p: a for p, a in self.attempts.items() if group[p[0].robot] == group[p[1].robot]}
+
+    def joins(self, one: str, other: str) -> bool:
+        """Whether an alignment between maps of two robots is believed."""
+        return any(a.edge and {v.robot for v in pair} == {one, other} for pair, a in self.attempts.items())
+
+    def look(self, graph: JointGraph, maps: Mapping[VertexId, Surface], most: int) -> bool:
+        """Try the pairs of a component that are due, at most so many; whether any was.
+
+        Args:
+            graph: of the component; its edges are not touched.
+            maps: of its closed vertices.
+        """
+        poses = graph.estimates()
+        closed = {v: maps[v] for v in poses if v in maps}
+
+        def wanted(a: VertexId, b: VertexId) -> bool:
+            return not self._aligned((a, b), (closed[a], closed[b]))
+
+        near = pairs(closed, poses, graph.relative, wanted, most=len(poses) ** 2)
+        due = [c for c in near if self._due((c.a, c.b), (closed[c.a], closed[c.b]), c.guess)][:most]
+        for a, b, guess in due:
+            self._try((a, b), (closed[a], closed[b]), guess)
+        return bool(due)
+
+    def take_back(self, graph: JointGraph) -> list[EdgeId]:
+        """Give up alignments in ``graph`` that the joint estimate contradicts; their edges are to be removed."""
+        gone = []
+        present = {edge.id for edge in graph.edges()}
+        for pair, attempt in self.attempts.items():
+            if attempt.edge is None or attempt.edge.id not in present:
+                continue
+            chi2 = graph.chi2(attempt.edge.id)
+            if chi2 > CONTRADICTED:
+                reason = f"taken back: chi2 {chi2:.1f} from the joint estimate, more than {CONTRADICTED}"
+                self.attempts[pair] = Attempt(attempt.maps, attempt.guess, attempt.found, None, reason)
+                gone.append(attempt.edge.id)
+        return gone
+
+    def _aligned(self, pair: Pair, maps: tuple[Surface, Surface]) -> bool:
+        """Whether the pair, as its maps are now, has an alignment that is believed."""
+        old = self.attempts.get(pair)
+        return old is not None and old.edge is not None and _unchanged(old, maps)
+
+    def _due(self, pair: Pair, maps: tuple[Surface, Surface], guess: UncertainPose) -> bool:
+        """Whether a pair without an alignment is worth a try, the first or another."""
+        old = self.attempts.get(pair)
+        if old is None or not _unchanged(old, maps):
+            return True
+        offset = gtsam.Pose2.Logmap(old.guess.pose.between(guess.pose))
+        moved = float(offset @ np.linalg.solve(old.guess.covariance, offset))
+        return moved > MOVED or np.linalg.det(old.guess.covariance) > SURER**2 * np.linalg.det(guess.covariance)
+
+    def _try(self, pair: Pair, maps: tuple[Surface, Surface], guess: UncertainPose) -> None:
+        found = align(*maps, guess)
+        edge, refusal = None, "nothing of the maps can meet"
+        if found is not None:
+            refusal = found.refusal or ""
+            if not refusal:
+                version = self._versions[pair] = self._versions.get(pair, -1) + 1
+                name = EdgeId(f"{pair[0]}={pair[1]}", 0)
+                pose, covariance = found.estimate
+                edge = Edge(name, version, EdgeKind.ALIGNMENT, *pair, pose, covariance)
+        self.attempts[pair] = Attempt(maps, guess, found, edge, refusal)
+
+
+def _unchanged(attempt: Attempt, maps: tuple[Surface, Surface]) -> bool:
+    return attempt.maps[0] is maps[0] and attempt.maps[1] is maps[1]

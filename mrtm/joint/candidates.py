@@ -1,0 +1,77 @@
+"""Which closed maps are worth aligning after an event: those that are likely to overlap, not all pairs of all."""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from factors import UncertainPose, VertexId
+from frontend import se2
+from frontend.records import FloatArray
+from mrtm.joint.agreement import overlap
+from mrtm.joint.alignment import LEAST_OVERLAP
+from mrtm.joint.correlative import MAX_XY
+from mrtm.joint.surface import Surface
+from mrtm.robot.poses import array_of
+
+MOST = 12  # pairs an event
+
+
+class Candidate(NamedTuple):
+    """Two vertices whose maps likely overlap, ``a`` before ``b``, and a_T_b as it is known."""
+
+    a: VertexId
+    b: VertexId
+    guess: UncertainPose
+
+
+def pairs(
+    maps: Mapping[VertexId, Surface],
+    poses: Mapping[VertexId, gtsam.Pose2],
+    relative: Callable[[VertexId, VertexId], UncertainPose],
+    wanted: Callable[[VertexId, VertexId], bool] = lambda a, b: True,
+    most: int = MOST,
+) -> list[Candidate]:
+    """The pairs of maps to align, the largest overlap first.
+
+    Args:
+        maps: of closed vertices of one component.
+        poses: joint_T_local of at least these.
+        relative: a_T_b and its covariance in the frame of b, such as ``JointGraph.relative``; asked of near pairs only.
+        wanted: whether a pair, a before b, is worth a look at all. All by default.
+        most: pairs at most.
+    """
+    circles = {vertex: _circle(surface, poses[vertex]) for vertex, surface in maps.items() if len(surface.points)}
+    found: list[tuple[float, Candidate]] = []
+    for a in sorted(circles):
+        for b in sorted(circles):
+            if a >= b or not wanted(a, b):
+                continue
+            apart = np.hypot(*(circles[a][:2] - circles[b][:2])) - circles[a][2] - circles[b][2]
+            if apart > MAX_XY:
+                continue
+            guess = relative(a, b)
+            if apart > 3.0 * np.sqrt(np.linalg.eigvalsh(guess.covariance[:2, :2])[1]):
+                continue
+            area = _likely_overlap(maps[a], maps[b], guess)
+            if area >= LEAST_OVERLAP:
+                found.append((area, Candidate(a, b, guess)))
+    found.sort(key=lambda item: (-item[0], item[1].a, item[1].b))
+    return [candidate for _, candidate in found[:most]]
+
+
+def _circle(surface: Surface, pose: gtsam.Pose2) -> FloatArray:
+    """Around what a map knows: x, y, radius in the joint frame."""
+    low, high = surface.points.min(axis=0), surface.points.max(axis=0)
+    centre = np.append(0.5 * (low + high), 0.0)
+    return np.append(se2.compose(array_of(pose), centre)[:2], 0.5 * np.hypot(*(high - low)))
+
+
+def _likely_overlap(a: Surface, b: Surface, guess: UncertainPose) -> float:
+    """m^2 known in both, at the guess or a standard deviation beside it along its weakest direction, the most."""
+    values, vectors = np.linalg.eigh(guess.covariance)
+    aside = np.sqrt(values[2]) * vectors[:, 2]
+    start = array_of(guess.pose)
+    places = (start, se2.compose(start, aside), se2.compose(start, -aside))
+    return max(overlap(a.lookup, b.lookup, place) for place in places)

@@ -1,0 +1,196 @@
+"""What somebody makes of all the edges they have heard of: a joint graph for every connected component."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import gtsam
+
+from factors import Edge, EdgeId, GraphEdge, VertexId
+from mrtm.joint.graph import GraphError, JointGraph
+
+
+@dataclass(slots=True)
+class Component:
+    """Robots in one frame.
+
+    Attributes:
+        robots: ascending.
+        graph: all their edges, and those added; without added ones the robot's own graph.
+        added: what came to them: edges between robots, and alignments of maps, by their ids.
+    """
+
+    robots: tuple[str, ...]
+    graph: JointGraph
+    added: dict[EdgeId, GraphEdge] = field(default_factory=dict)
+
+
+class JointMap:
+    """The joint maps of a team, as far as known.
+
+    Every robot's own edges are first solved by themselves, each robot in its own frame ("kept aside"). Fusing edges
+    join them into components. A component's frame is that of the first of its robots' names, whoever makes the map:
+    the same edges make the same map.
+
+    Attributes:
+        refused: edges that cannot be, and why. One is left out until it comes in a higher version.
+    """
+
+    def __init__(self) -> None:
+        self.refused: dict[EdgeId, str] = {}
+        self._refused: dict[EdgeId, int] = {}  # their versions
+        self._own: dict[str, JointGraph] = {}
+        self._unconnected: dict[EdgeId, Edge] = {}
+        self._component: dict[str, Component] = {}
+
+    @property
+    def robots(self) -> Mapping[str, JointGraph]:
+        """Every robot heard of, and the graph of its own edges."""
+        return self._own
+
+    def components(self) -> list[Component]:
+        """All of them, in the order of their first robots' names."""
+        return list({c.robots: c for _, c in sorted(self._component.items())}.values())
+
+    def component(self, robot: str) -> Component:
+        """The one a robot is in."""
+        return self._component[robot]
+
+    def seen_from(self, robot: str) -> dict[VertexId, gtsam.Pose2]:
+        """The poses of all vertices of a robot's component in that robot's frame, the one of its first vertex."""
+        poses = self._component[robot].graph.estimates()
+        root = poses[VertexId(robot, 0)]
+        return {vertex: root.between(pose) for vertex, pose in poses.items()}
+
+    def learn(self, edges: Iterable[Edge], robots: Iterable[str] = ()) -> None:
+        """Take new edges, and new versions of known ones, that robots made within their own maps (M5, M7, M8).
+
+        Any order will do: an edge that nothing connects yet waits for those that do, and a version that comes after a
+        higher one does nothing. An edge that cannot be is ``refused``, and nothing else suffers.
+
+        Args:
+            robots: names of robots heard of; one with a single vertex has no edge.
+        """
+        waiting = self._unconnected
+        for edge in edges:
+            before = waiting[edge.id].version if edge.id in waiting else self._refused.get(edge.id, -1)
+            if edge.version > before:
+                waiting[edge.id] = edge
+        for robot in {*robots, *(edge_id.robot for edge_id in waiting)} - self._own.keys():
+            self._own[robot] = JointGraph(VertexId(robot, 0))
+            self._apart([robot])
+        for robot in sorted({edge_id.robot for edge_id in waiting}):
+            self._enter(robot, [edge for edge_id, edge in sorted(waiting.items()) if edge_id.robot == robot])
+
+    def _enter(self, robot: str, edges: Iterable[Edge]) -> None:
+        """Enter those of a robot's waiting edges that are connected to its root."""
+        own, component = self._own[robot], self._component[robot]
+        known, present = set(own.vertices()), {edge.id: edge.version for edge in own.edges()}
+        replace = [edge for edge in edges if edge.id in present]
+        new = [edge for edge in edges if edge.id not in present]
+        add: list[Edge] = []
+        while reached := [edge for edge in new if edge.tail in known or edge.head in known]:
+            known |= {end for edge in reached for end in (edge.tail, edge.head)}
+            add += reached
+            new = [edge for edge in new if edge not in reached]
+        for edge in (*add, *replace):
+            del self._unconnected[edge.id]
+        replace = [edge for edge in replace if edge.version > present[edge.id]]
+        change = [*add, *replace]
+        try:
+            _check_ends(robot, change)
+            own.update(add=add, replace=replace)
+        except GraphError as error:
+            for edge in change if len(change) > 1 else ():  # one by one: which is it?
+                self._unconnected[edge.id] = edge
+                self._enter(robot, [edge])
+            if len(change) == 1:
+                self._refuse(change[0], error)
+            return
+        if change and component.graph is not own:
+            try:
+                component.graph.update(add=add, replace=replace)
+            except GraphError:
+                self._apart(component.robots)  # ``join`` makes it anew
+
+    def join(self, added: Iterable[GraphEdge]) -> None:
+        """Let ``added`` be all the edges beside the robots' own (M11, M13): robots come into one frame, or fall apart.
+
+        Edges that fix a pose join; a range and bearing between robots that nothing else joins is left out. Where the
+        equations cannot be solved with them, the robots stay apart and one of the edges is ``refused``.
+        """
+        edges = {edge.id: edge for edge in sorted(added, key=lambda e: e.id)}
+        for robots in self.connected(edges.values()):
+            mine = {i: e for i, e in edges.items() if _ends(e) <= set(robots)}
+            component = self._component[robots[0]]
+            if component.robots == robots and component.added.keys() and mine:
+                try:
+                    _exchange(component, mine)
+                    continue
+                except GraphError:
+                    pass  # perhaps on the way there only
+            try:
+                component = Component(robots, self._graph_of(robots, mine), mine)
+            except GraphError as error:
+                self._refuse(next(iter(mine.values())), error)
+                self._apart(robots)
+            else:
+                self._component.update(dict.fromkeys(robots, component))
+
+    def _refuse(self, edge: GraphEdge, error: GraphError) -> None:
+        self.refused[edge.id] = f"{edge}: refused: {error}"
+        self._refused[edge.id] = edge.version
+
+    def _apart(self, robots: Iterable[str]) -> None:
+        """Let every robot have its own map."""
+        for robot in robots:
+            self._component[robot] = Component((robot,), self._own[robot])
+
+    def connected(self, edges: Iterable[GraphEdge]) -> list[tuple[str, ...]]:
+        """The robots that edges would bring together, names ascending."""
+        group = {robot: {robot} for robot in self._own}
+        for edge in edges:
+            a, b = group[edge.tail.robot], group[edge.head.robot]
+            if edge.estimate is not None and a is not b:
+                a |= b
+                group.update(dict.fromkeys(b, a))
+        return sorted({tuple(sorted(members)) for members in group.values()})
+
+    def _graph_of(self, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> JointGraph:
+        """The robots' own graphs made one: the first one's, then the others in the order in which they are reached."""
+        root = robots[0]
+        if not added:
+            return self._own[root]
+        graph = JointGraph(VertexId(root, 0))
+        graph.update(add=self._own[root].edges())
+        reached = {root}
+        graph.update(add=[e for e in added.values() if _ends(e) == reached])
+        while len(reached) < len(robots):
+            bridge = next(e for e in added.values() if e.estimate and _ends(e) & reached and _ends(e) - reached)
+            both = reached | _ends(bridge)
+            more = [e for e in added.values() if e is not bridge and _ends(e) <= both and not _ends(e) <= reached]
+            graph.merge(self._own[(both - reached).pop()], bridge, more)
+            reached = both
+        return graph
+
+
+def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
+    """Bring a component whose robots stay the same to other added edges."""
+    before = component.added
+    add = [e for i, e in added.items() if i not in before]
+    replace = [e for i, e in added.items() if i in before and e.version > before[i].version]
+    gone = [i for i in before if i not in added]
+    if add:
+        component.graph.update(add=add)  # first, so that no robot is cut off in between
+    if replace or gone:
+        component.graph.update(replace=replace, remove=gone)
+    component.added = added
+
+
+def _check_ends(robot: str, edges: Iterable[Edge]) -> None:
+    for edge in edges:
+        if _ends(edge) != {robot}:
+            raise GraphError(f"a robot's own edges join its own vertices, not those of {edge.tail} and {edge.head}")
+
+
+def _ends(edge: GraphEdge) -> set[str]:
+    return {edge.tail.robot, edge.head.robot}

@@ -1,0 +1,150 @@
+"""What the local maps of two robots say of an offset between them, for sightings that cannot decide it alone.
+
+A sighting is good to a few decimetres at the far side of a local map, so the pose is first fitted within its own
+uncertainty. Then the maps agree, contradict each other, or say nothing: also where they agree as well with themselves
+moved along, as a corridor does.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors import UncertainPose, VertexId, compose, inverse
+from frontend import se2
+from mrtm.joint.agreement import (
+    LEAST_POINTS,
+    Agreement,
+    Decision,
+    FloatArray,
+    Lookup,
+    agreement,
+    known,
+    overlap,
+    scores,
+)
+from mrtm.joint.hypotheses import RobotGraph, coordinates
+
+LEAST_OVERLAP = 20.0
+"""Area known in both maps, m^2, below which they say nothing."""
+
+AGREEING = (0.65, 0.12)
+"""At least so many hits and at most so many conflicts."""
+
+CONTRADICTING = (0.4, 0.3)
+"""At most so many hits and at least so many conflicts."""
+
+UNIQUE = 0.15
+"""By which the score has to fall wherever one map is moved along the direction that the walls fix least."""
+
+SIGMAS = 3.0
+"""How far the fit may move a pose, in standard deviations of each axis."""
+
+WIDEST = (1.2, 0.25)
+"""Metres and radians beyond which a pose is too uncertain to be fitted, and its maps are not asked."""
+
+MOST_PAIRS = 3
+"""Pairs of local maps that are compared, those that overlap most."""
+
+_STEPS = ((0.1, 0.02), (0.05, 0.01))  # metres and radians, coarse and fine
+_FINE = np.array([0.1, 0.1, 0.02])
+_SHIFTS = np.arange(0.6, 4.01, 0.2)
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """Two local maps at the pose that fits best: a_T_b (3,), how they agree there, and how clearly.
+
+    Attributes:
+        lead: score there less the best score with one map moved along.
+    """
+
+    pose: FloatArray
+    agreement: Agreement
+    lead: float
+
+    @property
+    def decision(self) -> Decision:
+        """What it says; the bounds come from true and false overlaps of real local maps."""
+        found = self.agreement
+        if found.overlap < LEAST_OVERLAP or found.points < LEAST_POINTS:
+            return Decision.UNDECIDED
+        if found.hits <= CONTRADICTING[0] and found.conflicts >= CONTRADICTING[1]:
+            return Decision.CONTRADICTS
+        agrees = found.hits >= AGREEING[0] and found.conflicts <= AGREEING[1]
+        return Decision.AGREES if agrees and self.lead >= UNIQUE else Decision.UNDECIDED
+
+
+def fit(a: Lookup, b: Lookup, guess: FloatArray, half: FloatArray) -> Fit:
+    """The best pose a_T_b (3,) within ``half`` (3,), metres and radians, of ``guess``."""
+    pose = guess
+    for (step, turn), width in zip(_STEPS, (half, _FINE), strict=True):
+        tried = se2.compose(pose, _around(width, step, turn))
+        score = scores(a, b, tried)
+        if score.max() > scores(a, b, pose[None])[0]:
+            pose = tried[int(np.argmax(score))]
+    axis = _weak_direction(a, b, pose)
+    way = np.concatenate([_SHIFTS, -_SHIFTS])
+    moved = []
+    for angle in (axis, axis + 0.5 * np.pi):
+        shift = np.outer(way, [np.cos(angle), np.sin(angle), 0.0])
+        moved.append(se2.compose((pose + shift)[:, None], _around(_FINE, 0.1, 0.02)[None]).reshape(-1, 3))
+    here = agreement(a, b, pose)
+    # Moved sideways two corridors touch wall to wall, which is no overlap: that leaves few of the points.
+    elsewhere = scores(a, b, np.concatenate(moved), max(LEAST_POINTS, here.points // 2)).max()
+    return Fit(pose, here, float(scores(a, b, pose[None])[0] - elsewhere))
+
+
+class MapEvidence:
+    """The word of the local maps, as :func:`mrtm.joint.consistency.judge` asks for it.
+
+    Args:
+        maps: of all robots, ready for comparison.
+        graphs: each robot's own, by name, with all vertices that have a map.
+    """
+
+    def __init__(self, maps: Mapping[VertexId, Lookup], graphs: Mapping[str, RobotGraph]) -> None:
+        self._maps, self._graphs = maps, graphs
+
+    def __call__(self, tail: VertexId, head: VertexId, tail_T_head: UncertainPose) -> Decision:
+        """What the maps of two robots say if ``head`` lies there: one contradiction outweighs any agreement."""
+        overlaps = []
+        for u, u_T_tail in self._around(tail):
+            for v, v_T_head in self._around(head):
+                seen = compose(compose(u_T_tail, tail_T_head), inverse(v_T_head))
+                sigma = np.sqrt(np.diag(seen.covariance))
+                if max(sigma[0], sigma[1]) < WIDEST[0] / SIGMAS and sigma[2] < WIDEST[1] / SIGMAS:
+                    pose = np.array(coordinates(seen.pose))
+                    overlaps.append((overlap(self._maps[u], self._maps[v], pose), u, v, pose, sigma))
+        overlaps.sort(key=lambda o: (-o[0], o[1], o[2]))
+        said = {
+            fit(self._maps[u], self._maps[v], pose, SIGMAS * sigma).decision
+            for area, u, v, pose, sigma in overlaps[:MOST_PAIRS]
+            if area >= LEAST_OVERLAP
+        }
+        return next((word for word in (Decision.CONTRADICTS, Decision.AGREES) if word in said), Decision.UNDECIDED)
+
+    def _around(self, vertex: VertexId) -> list[tuple[VertexId, UncertainPose]]:
+        """The vertices of a robot that have a map, and where ``vertex`` lies in each."""
+        graph, nowhere = self._graphs[vertex.robot], UncertainPose(gtsam.Pose2(), np.zeros((3, 3)))
+        owned = sorted(v for v in self._maps if v.robot == vertex.robot)
+        return [(v, nowhere if v == vertex else graph.relative(v, vertex)) for v in owned]
+
+
+def _around(half: FloatArray, step: float, turn: float) -> FloatArray:
+    """(k, 3) a grid of small motions within plus and minus ``half`` (3,)."""
+    counts = np.maximum(np.ceil(half / np.array([step, step, turn]) - 1e-9), 1).astype(int)
+    axes = [np.arange(-n, n + 1) * size for n, size in zip(counts, (step, step, turn), strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _weak_direction(a: Lookup, b: Lookup, a_T_b: FloatArray) -> float:
+    """The direction, in the frame of a, in which the surfaces in the overlap fix the pose least."""
+    here = a.normals[known(b, a.points, se2.inverse(a_T_b))]
+    there = b.normals[known(a, b.points, a_T_b)]
+    normals = np.concatenate(
+        [here, se2.compose(np.array([0.0, 0.0, a_T_b[2]]), np.column_stack([there, 0 * there[:, :1]]))[:, :2]]
+    )
+    weakest = np.linalg.eigh(normals.T @ normals)[1][:, 0]
+    return float(np.arctan2(weakest[1], weakest[0]))

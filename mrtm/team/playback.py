@@ -1,0 +1,218 @@
+"""A team played by one clock: robots drive, meet, exchange what they know, and solve their joint maps (M9 to M13)."""
+
+import heapq
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import gtsam
+import numpy as np
+
+from factors import VertexId
+from frontend import se2
+from mrtm.config import Config
+from mrtm.joint.consistency import Verdict
+from mrtm.result import EdgeFate, Meeting, RunResult, SightingFate, TeamStory, Trajectory
+from mrtm.robot.poses import array_of
+from mrtm.team.codec import pack
+from mrtm.team.exchange import exchange
+from mrtm.team.member import MemberRun
+from mrtm.team.records import Record, SightingRecord
+from mrtm.team.session_file import TimedSighting
+from mrtm.team.store import item_of
+from mrtm.team.teammate import Peers, Teammate
+from mrtm.timing import Stages
+
+LINGER = 0.5  # seconds that robots stay in contact after a sighting, so that they know where they were
+
+
+def play(
+    runs: Sequence[MemberRun],
+    sightings: Sequence[TimedSighting],
+    config: Config,
+    report: Callable[[float], None] = lambda fraction: None,
+) -> RunResult:
+    """Let robots that have been mapped by themselves meet as their sightings say.
+
+    Every robot makes its own joint map of what it has heard. The result is that of somebody who in the end hears all
+    (M13): the best there is.
+
+    Args:
+        runs: of the front ends, one a robot.
+        sightings: between them, by team time.
+        report: told now and then which fraction of the meetings has passed.
+    """
+    playback = _Playback(runs, sightings, config)
+    playback.play(report)
+    return playback.result(config)
+
+
+class _Playback:
+    def __init__(self, runs: Sequence[MemberRun], sightings: Sequence[TimedSighting], config: Config) -> None:
+        self._runs = runs
+        self._config = config
+        self._stages = Stages()
+        peers = Peers()
+        self._team = {run.robot: Teammate(run.robot, config, self._stages, peers) for run in runs}
+        self._listener = Teammate(None, config, self._stages, peers)
+        self._sightings = _numbered(sightings)
+        self._meetings: list[Meeting] = []
+        self._frames: list[tuple[float, frozenset[str]]] = []  # team time and robots of every new component
+
+    def play(self, report: Callable[[float], None]) -> None:
+        meetings = _meetings(self._sightings, self._config.team.exchange_interval)
+        told = deque[tuple[float, Record]](
+            heapq.merge(
+                *([(r.time, r) for r in run.records] for run in self._runs),
+                [(s.time, s) for s in self._sightings],
+                key=lambda item: item[0],
+            )
+        )
+        for number, (time, robots) in enumerate(meetings):
+            while told and told[0][0] <= time:
+                self._write_down(told.popleft()[1])
+            self._meet(time, robots)
+            report(number / len(meetings))
+        for _, record in told:
+            self._write_down(record)
+        for teammate in (*(self._team.values() if len(self._team) > 1 else ()), self._listener):
+            teammate.settle()
+
+    def _write_down(self, record: Record) -> None:
+        with self._stages("exchange"):
+            packed = item_of(pack(record))
+            for teammate in (self._team[record.key.robot], self._listener):
+                teammate.store.add(packed)
+
+    def _meet(self, time: float, robots: tuple[str, str]) -> None:
+        """M10 and M11."""
+        one, other = (self._team[robot] for robot in robots)
+        with self._stages("exchange"):
+            traffic = exchange(one.store, other.store)
+        for teammate in (one, other):
+            teammate.think()
+            teammate.align()
+            if teammate.name in teammate.joint.robots:  # else it has not taken a scan yet
+                self._frames.append((time, frozenset(teammate.joint.component(teammate.name).robots)))
+        verdict, reason = _verdict(one, robots)
+        self._meetings.append(Meeting(time, robots, dict(traffic.sent), verdict, reason))
+
+    def result(self, config: Config) -> RunResult:
+        """What is known at the end, in the joint maps of the listener."""
+        joint = self._listener.joint
+        components = joint.components()
+        poses = {v: pose for c in components for v, pose in c.graph.estimates().items()}
+        edges = [fate for run in self._runs for fate in run.past]
+        edges += [EdgeFate(e, "accepted", chi2=c.graph.chi2(e.id)) for c in components for e in c.graph.edges()]
+        stages = [*((run.seconds, run.longest) for run in self._runs), (self._stages.seconds, self._stages.longest)]
+        names = list(dict.fromkeys(name for seconds, _ in stages for name in seconds))
+        return RunResult(
+            config=config.model_dump(mode="json"),
+            seed=config.seed,
+            trajectories={run.robot: _trajectory(run, poses) for run in self._runs},
+            local_maps={vertex: local_map for run in self._runs for vertex, local_map in run.local_maps.items()},
+            vertex_poses=poses,
+            vertex_covariances={v: c.graph.marginal(v) for c in components for v in c.graph.vertices()},
+            components=[c.graph.vertices() for c in components],
+            edges=edges,
+            events=[event for run in self._runs for event in run.events],
+            timings={name: sum(seconds.get(name, 0.0) for seconds, _ in stages) for name in names},
+            longest={name: max(longest.get(name, 0.0) for _, longest in stages) for name in names},
+            counts={
+                "scans": sum(len(run.times) for run in self._runs),
+                "vertices": len(poses),
+                "edges": sum(len(c.graph.edges()) for c in components),
+            },
+            blemishes=list(dict.fromkeys(blemish for run in self._runs for blemish in run.blemishes))
+            + list(joint.refused.values()),
+            team=self._story() if len(self._runs) > 1 else None,
+        )
+
+    def _story(self) -> TeamStory:
+        largest = max((frozenset(c.robots) for c in self._listener.joint.components()), key=len)
+        together = [time for time, robots in self._frames if robots >= largest]
+        return TeamStory(
+            meetings=self._meetings,
+            sightings=[self._fate(sighting) for sighting in self._sightings],
+            first_meeting=self._meetings[0].time if self._meetings else None,
+            common_frame=together[0] if together and len(largest) > 1 else None,
+            known={name: _known(teammate) for name, teammate in self._team.items()},
+        )
+
+    def _fate(self, sighting: SightingRecord) -> SightingFate:
+        ends = sighting.time, sighting.observer, sighting.observed
+        judgement = self._listener.judgements.get((sighting.observer, sighting.number))
+        if judgement is None:
+            return SightingFate(*ends, "refused", "no scan at that time: where the robots were is not known")
+        numbers = {"support": float(judgement.support), "rival": float(judgement.rival)}
+        if judgement.chi2 is not None:
+            numbers["chi2"] = judgement.chi2
+        return SightingFate(*ends, str(judgement.verdict), judgement.reason, numbers)
+
+
+def _numbered(sightings: Sequence[TimedSighting]) -> list[SightingRecord]:
+    """The sightings as records: running numbers by observer, and the moments at which either robot notes its place."""
+    moments = {
+        robot: {time: number for number, time in enumerate(sighting_times(sightings, robot))}
+        for robot in {name for s in sightings for name in (s.observer, s.observed)}
+    }
+    count: Counter[str] = Counter()
+    records = []
+    for s in sorted(sightings, key=lambda s: s.time):
+        records.append(
+            SightingRecord(
+                s.observer, count[s.observer], 0, s.time, s.observed, s.measurement,
+                (s.observer, moments[s.observer][s.time]), (s.observed, moments[s.observed][s.time]),
+            )
+        )  # fmt: skip
+        count[s.observer] += 1
+    return records
+
+
+def sighting_times(sightings: Iterable[TimedSighting], robot: str) -> list[float]:
+    """Team times at which somebody saw the robot or was seen by it, ascending, each once."""
+    return sorted({s.time for s in sightings if robot in (s.observer, s.observed)})
+
+
+def _meetings(sightings: Iterable[SightingRecord], interval: float) -> list[tuple[float, tuple[str, str]]]:
+    """When which robots exchange: soon after they see each other, every ``interval`` while they do, and at its end."""
+    contacts: dict[tuple[str, str], list[list[float]]] = {}
+    for s in sightings:
+        pair = min(s.observer, s.observed), max(s.observer, s.observed)
+        runs = contacts.setdefault(pair, [])
+        if runs and s.time - runs[-1][-1] <= interval:
+            runs[-1].append(s.time)
+        else:
+            runs.append([s.time])
+    meetings = []
+    for pair, runs in contacts.items():
+        for times in runs:
+            due = -np.inf
+            for time in times:
+                if time >= due or time == times[-1]:
+                    meetings.append((time + LINGER, pair))
+                    due = time + interval
+    return sorted(meetings)
+
+
+def _verdict(teammate: Teammate, robots: tuple[str, str]) -> tuple[str, str]:
+    """What the sightings between two robots come to: the best verdict on any, and the last reason for it."""
+    found = [j for _, j in sorted(teammate.judgements_between(robots).items())]
+    for verdict in (Verdict.ACCEPTED, Verdict.WAITING, Verdict.REFUSED):
+        reasons = [j.reason for j in found if j.verdict is verdict]
+        if reasons:
+            return str(verdict), reasons[-1]
+    return str(Verdict.WAITING), "where the robots were is not known yet"
+
+
+def _known(teammate: Teammate) -> dict[str, int]:
+    """Vertices in the frame of a robot, by the robot that made them."""
+    assert teammate.name is not None
+    return dict(Counter(v.robot for v in teammate.joint.component(teammate.name).graph.vertices()))
+
+
+def _trajectory(run: MemberRun, poses: Mapping[VertexId, gtsam.Pose2]) -> Trajectory:
+    joint = np.zeros((len(run.times), 3))
+    for index in np.unique(run.vertices):
+        inside = run.vertices == index
+        joint[inside] = se2.compose(array_of(poses[VertexId(run.robot, int(index))]), run.poses[inside])
+    return Trajectory(run.times, joint, run.vertices)
