@@ -34,6 +34,9 @@ class Slack(NamedTuple):
     theta: float
 
 
+_HAIR = 1e-10  # of a variance
+
+
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
     """A sighting that may be true.
@@ -157,6 +160,8 @@ class Measurements:
             else:
                 between = compose(compose(observer, pose), inverse(observed))
                 measured[j], noise[j] = coordinates(between.pose), between.covariance
+        # A hair wider: seen from far off it is so long and thin that rounding would make it indefinite.
+        noise += _HAIR * np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         return cls(
             np.array([rows[h.observer] for h in hypotheses], np.int64),
             np.array([rows[h.observed] for h in hypotheses], np.int64),

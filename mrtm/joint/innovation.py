@@ -150,6 +150,8 @@ def _chi2(r, s, full):  # type: ignore[no-untyped-def]
         return np.inf  # beyond the gate even along the longest axis
     if not full:
         det = s[0, 0] * s[1, 1] - s[0, 1] * s[0, 1]
+        if det <= 0.0:
+            return np.inf  # too long and thin for double precision
         return (r[0] * r[0] * s[1, 1] - 2.0 * r[0] * r[1] * s[0, 1] + r[1] * r[1] * s[0, 0]) / det
     c00 = s[1, 1] * s[2, 2] - s[1, 2] * s[1, 2]
     c01 = s[0, 2] * s[1, 2] - s[0, 1] * s[2, 2]
@@ -158,6 +160,8 @@ def _chi2(r, s, full):  # type: ignore[no-untyped-def]
     c12 = s[0, 1] * s[0, 2] - s[0, 0] * s[1, 2]
     c22 = s[0, 0] * s[1, 1] - s[0, 1] * s[0, 1]
     det = s[0, 0] * c00 + s[0, 1] * c01 + s[0, 2] * c02
+    if det <= 0.0:
+        return np.inf
     q = r[0] * (c00 * r[0] + 2.0 * (c01 * r[1] + c02 * r[2])) + r[1] * (c11 * r[1] + 2.0 * c12 * r[2])
     return (q + c22 * r[2] * r[2]) / det
 

@@ -192,9 +192,13 @@ class Joining:
         for robots in self.components():
             which, vertices = self._inside(robots), self._vertices(robots)
             sightings, believed = self._among(robots, which), self.believed[which]
-            frame = solve([self._maps[robot] for robot in robots], sightings, believed, self._poses[vertices])
+            try:
+                frame = solve([self._maps[robot] for robot in robots], sightings, believed, self._poses[vertices])
+                examined = examine(frame, sightings, believed)
+            except np.linalg.LinAlgError:  # numbers beyond double precision: nothing can be said
+                self.believed[which] = False
+                continue
             self._poses[vertices] = frame.poses
-            examined = examine(frame, sightings, believed)
             self.chi2[which] = examined.chi2
             self._decidable[which] = _chance(examined.spread, sightings.full) < CHANCE
             first, row = {}, 0

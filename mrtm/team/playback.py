@@ -91,8 +91,8 @@ class _Playback:
         for teammate in (one, other):
             teammate.think()
             teammate.align()
-            if teammate.name in teammate.joint.robots:  # else it has not taken a scan yet
-                self._frames.append((time, frozenset(teammate.joint.component(teammate.name).robots)))
+            for robot in teammate.joint.robots.keys() & {teammate.name}:  # none if it has not taken a scan yet
+                self._frames.append((time, frozenset(teammate.joint.component(robot).robots)))
         verdict, reason = _verdict(one, robots)
         self._meetings.append(Meeting(time, robots, dict(traffic.sent), verdict, reason))
 
