@@ -32,12 +32,12 @@ class JointMap:
     the same edges make the same map.
 
     Attributes:
-        refused: edges that cannot be, and why. One is left out until it comes in a higher version.
+        refused: edges of which a version cannot be, and why; it is left out, as if it had not come.
     """
 
     def __init__(self) -> None:
         self.refused: dict[EdgeId, str] = {}
-        self._refused: dict[EdgeId, int] = {}  # their versions
+        self._refused: set[tuple[EdgeId, int]] = set()  # the versions that were
         self._own: dict[str, JointGraph] = {}
         self._unconnected: dict[EdgeId, Edge] = {}
         self._component: dict[str, Component] = {}
@@ -72,9 +72,14 @@ class JointMap:
         """
         waiting = self._unconnected
         for edge in edges:
-            before = waiting[edge.id].version if edge.id in waiting else self._refused.get(edge.id, -1)
-            if edge.version > before:
+            if (edge.id, edge.version) in self._refused:
+                continue
+            if edge.id in waiting and waiting[edge.id].version >= edge.version:
+                continue
+            if _ends(edge) == {edge.id.robot}:
                 waiting[edge.id] = edge
+            else:
+                self._refuse(edge, "a robot's own edges join its own vertices")
         for robot in {*robots, *(edge_id.robot for edge_id in waiting)} - self._own.keys():
             self._own[robot] = JointGraph(VertexId(robot, 0))
             self._apart([robot])
@@ -97,14 +102,13 @@ class JointMap:
         replace = [edge for edge in replace if edge.version > present[edge.id]]
         change = [*add, *replace]
         try:
-            _check_ends(robot, change)
             own.update(add=add, replace=replace)
         except GraphError as error:
             for edge in change if len(change) > 1 else ():  # one by one: which is it?
                 self._unconnected[edge.id] = edge
                 self._enter(robot, [edge])
             if len(change) == 1:
-                self._refuse(change[0], error)
+                self._refuse(change[0], str(error))
             return
         if change and component.graph is not own:
             try:
@@ -131,14 +135,14 @@ class JointMap:
             try:
                 component = Component(robots, self._graph_of(robots, mine), mine)
             except GraphError as error:
-                self._refuse(next(iter(mine.values())), error)
+                self._refuse(next(iter(mine.values())), str(error))
                 self._apart(robots)
             else:
                 self._component.update(dict.fromkeys(robots, component))
 
-    def _refuse(self, edge: GraphEdge, error: GraphError) -> None:
-        self.refused[edge.id] = f"{edge}: refused: {error}"
-        self._refused[edge.id] = edge.version
+    def _refuse(self, edge: GraphEdge, reason: str) -> None:
+        self.refused[edge.id] = f"{edge}: refused: {reason}"
+        self._refused.add((edge.id, edge.version))
 
     def _apart(self, robots: Iterable[str]) -> None:
         """Let every robot have its own map."""
@@ -184,12 +188,6 @@ def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
     if replace or gone:
         component.graph.update(replace=replace, remove=gone)
     component.added = added
-
-
-def _check_ends(robot: str, edges: Iterable[Edge]) -> None:
-    for edge in edges:
-        if _ends(edge) != {robot}:
-            raise GraphError(f"a robot's own edges join its own vertices, not those of {edge.tail} and {edge.head}")
 
 
 def _ends(edge: GraphEdge) -> set[str]:
