@@ -19,9 +19,9 @@ PATCH = 1.5  # metres of a wall that share an error
 POINT, COMMON = 0.005, 0.003  # metres: least standard deviation of a point's own error, and of a patch's
 NORMAL_NOISE = 0.01  # variance of a normal's direction, rad^2: makes a bare wall seem to say something along itself
 # Calibrated by maximum likelihood on simulated pairs in six kinds of buildings (tools/alignment.py shows the NEES):
-SCALE = 3.0  # of the variance from the points: two maps err at the same corners and doors
-DRIFT_XY = 2.3e-3  # m / sqrt(m), and
-DRIFT_THETA = 3.2e-4  # rad / sqrt(m) of a map a metre wide, away from its origin; less in wider ones, in proportion
+SCALE = 2.0  # of the variance from the points: two maps err at the same corners and doors
+DRIFT_XY = 1.0e-3  # m / sqrt(m), and
+DRIFT_THETA = 1.8e-4  # rad / sqrt(m) of a map a metre wide, away from its origin; less in wider ones, in proportion
 LEAST_SCATTER = 0.01  # of the normals that still hold a map together in a direction
 
 
@@ -100,7 +100,9 @@ def _drift(surface: Surface, point: FloatArray) -> FloatArray:
     lever = np.array([y, -x])
     theta = DRIFT_THETA**2
     result = np.empty((3, 3))
-    result[:2, :2] = DRIFT_XY**2 * np.linalg.inv(2.0 * (surface.scatter + LEAST_SCATTER * np.eye(2)))
+    # Inversely with the square: walls that say little in a direction leave whole stretches in which none says anything.
+    held = np.linalg.inv(2.0 * (surface.scatter + LEAST_SCATTER * np.eye(2)))
+    result[:2, :2] = DRIFT_XY**2 * held @ held
     result[:2, :2] += theta * np.outer(lever, lever) / 3.0
     result[:2, 2] = result[2, :2] = 0.5 * theta * lever
     result[2, 2] = theta
