@@ -21,8 +21,8 @@ Pair = tuple[VertexId, VertexId]
 MOVED = 4.0
 """Squared Mahalanobis distance, as the first guess saw it, beyond which a new guess is another question."""
 
-CONTRADICTED = 16.27
-"""chi2 of 3 degrees of freedom, 99.9 %: an alignment so far from the joint estimate is taken back."""
+CONTRADICTED = 30.0
+"""chi2 of 3 degrees of freedom, as for loops: an alignment so far from the joint estimate is taken back."""
 
 SURER = 4.0
 """Times the volume of the first guess's covariance over the new one's for a refused pair to be worth another look."""

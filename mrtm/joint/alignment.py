@@ -17,12 +17,12 @@ from mrtm.robot.poses import array_of, innovation, pose_of
 
 LEAST_OVERLAP = 10.0  # m^2 known in both maps
 LEAST_PAIRS = 150  # points of one surface: 7.5 m of wall
-MOST_RESIDUAL = 0.03  # metres, rms: points of a cell's width that do not fit are not noise
+MOST_RESIDUAL = 0.035  # metres, rms: points of a cell's width that do not fit are not noise
 LEAST_HITS = 0.7  # of the surface points in space known to the other map that must lie on its surfaces
-MOST_CONFLICTS = 0.08  # of them that may lie in space it says is free: doors and people move
+MOST_CONFLICTS = 0.15  # of them that may lie in space it says is free: doors and people move
 MOST_RIVAL = 0.9  # of the best place's score that another may have; long walls fit fairly well at many places
 RIVAL_POINTS = 0.3  # of the best place's points that another must compare: a small overlap easily fits
-GATE = 16.27  # chi2 of 3 degrees of freedom, 99.9 %: farther from the guess it is another place, or a wrong guess
+GATE = 30.0  # chi2 of 3 degrees of freedom, as for loops: real maps have heavier tails; farther from the guess it is another place, or a wrong guess
 DISTINCT = 25.0  # squared Mahalanobis distance between two optima that are not one
 SLIDING = 0.92  # of the score at a slid position from which on the position is not seen
 PROBES = (-1.0, -0.6, 0.6, 1.0)  # metres slid to see whether the position matters

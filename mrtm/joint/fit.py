@@ -20,8 +20,10 @@ POINT, COMMON = 0.005, 0.003  # metres: least standard deviation of a point's ow
 NORMAL_NOISE = 0.01  # variance of a normal's direction, rad^2: makes a bare wall seem to say something along itself
 # Calibrated by maximum likelihood on simulated pairs in six kinds of buildings (tools/alignment.py shows the NEES):
 SCALE = 2.0  # of the variance from the points: two maps err at the same corners and doors
-DRIFT_XY = 1.0e-3  # m / sqrt(m), and
+DRIFT_XY = 0.8e-3  # m / sqrt(m), and
 DRIFT_THETA = 1.8e-4  # rad / sqrt(m) of a map a metre wide, away from its origin; less in wider ones, in proportion
+FLOOR = 0.003  # metres: of every alignment, for slips within a map
+FITTING = 0.013  # metres: residual of maps that bend as simulated ones do; those that fit less well bend more
 LEAST_SCATTER = 0.01  # of the normals that still hold a map together in a direction
 
 
@@ -63,9 +65,12 @@ def fit(a: Surface, b: Surface, a_T_b: FloatArray) -> Fit:
     carried = _adjoint(b_T_a)
     at_a = rotation(a_T_b[2]) @ centre + a_T_b[:2]
     drift = _drift(b, centre) + carried @ _drift(a, at_a) @ carried.T
+    drift[:2, :2] += FLOOR**2 * np.eye(2)
+    residual = float(np.sqrt(np.mean(np.square(residuals))))
+    drift *= max(1.0, residual / FITTING) ** 4
     return Fit(
         len(points),
-        float(np.sqrt(np.mean(np.square(residuals)))),
+        residual,
         (vectors * np.maximum(values, 0.0)) @ vectors.T / SCALE,
         drift,
     )

@@ -18,6 +18,7 @@ import zstandard
 
 from frontend.local_map import Grid
 from frontend.records import FloatArray
+from mrtm.joint.agreement import FREE
 from mrtm.joint.fusion import FREE_VOTE, OCCUPIED_VOTE
 from mrtm.team.checks import MOST_POINTS, RecordError, check_frame
 
@@ -26,8 +27,8 @@ Cells = npt.NDArray[np.uint8]
 VALUES = np.array([-FREE_VOTE, 0.0, 0.85, 2.0, OCCUPIED_VOTE], np.float32)
 """Log-odds: free, unknown, occupied by one hit of the filter's, by some, by many."""
 
-CUTS = (-0.6, 0.2, 1.4, 3.0)
-"""Borders between them; -0.6 is about where a cell of a picture turns free (p = 0.35)."""
+CUTS = (FREE, 0.2, 1.4, 3.0)
+"""Borders between them."""
 
 ANGLES = 64
 STEPS = 8

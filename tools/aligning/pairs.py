@@ -16,6 +16,7 @@ from mrtm.joint.alignment import Alignment, align
 from mrtm.joint.surface import Surface, partners
 from mrtm.robot.poses import array_of, pose_of
 from mrtm.session import map_scans
+from mrtm.team.map_codec import pack_map, unpack_map
 from tools.simulation import BUILDINGS, FloorPlan, OdometryNoise, simulate
 from tools.simulation.construction import Points, wall
 
@@ -124,10 +125,12 @@ def _maps(plan: FloorPlan, route: str, seed: int) -> list[Placed]:
     # A small travel square where everything is small: several maps that must be told apart.
     options = ["frontend.travel_square=8", "frontend.sensing_range=8"] if plan.name == "twins" else []
     result = map_scans(log.scans(), load_config(options=[f"seed={seed}", *options]))
-    return [
-        Placed(Surface.of(m), se2.compose(log.poses[m.scans[0]], se2.inverse(m.poses[0])))
-        for m in result.local_maps.values()
-    ]
+    placed = []
+    for m in result.local_maps.values():
+        grid, cloud, normals = unpack_map(pack_map(m.grid, m.cloud, m.normals), plan.name)  # as robots align them
+        frame = se2.compose(log.poses[m.scans[0]], se2.inverse(m.poses[0]))
+        placed.append(Placed(Surface.of(replace(m, grid=grid, cloud=cloud, normals=normals)), frame))
+    return placed
 
 
 def cases(plan: str, seed: int, sigma: FloatArray) -> Iterator[tuple[str, FloatArray, UncertainPose, Surface, Surface]]:
