@@ -20,11 +20,11 @@ POINT, COMMON = 0.005, 0.003  # metres: least standard deviation of a point's ow
 NORMAL_NOISE = 0.01  # variance of a normal's direction, rad^2: makes a bare wall seem to say something along itself
 # Calibrated by maximum likelihood on simulated pairs in six kinds of buildings (tools/alignment.py shows the NEES):
 SCALE = 2.0  # of the variance from the points: two maps err at the same corners and doors
-DRIFT_XY = 0.8e-3  # m / sqrt(m), and
-DRIFT_THETA = 1.8e-4  # rad / sqrt(m) of a map a metre wide, away from its origin; less in wider ones, in proportion
+DRIFT_XY = 1.2e-3  # m / sqrt(m), and
+DRIFT_THETA = 2.4e-4  # rad / sqrt(m) of a map a metre wide, away from its origin; less in wider ones, in proportion
 FLOOR = 0.003  # metres: of every alignment, for slips within a map
 FITTING = 0.013  # metres: residual of maps that bend as simulated ones do; those that fit less well bend more
-LEAST_SCATTER = 0.01  # of the normals that still hold a map together in a direction
+LEAST_SCATTER = 0.003  # of the normals that still hold a map together in a direction
 
 
 @dataclass(frozen=True, slots=True)
