@@ -33,7 +33,9 @@ class Evidence:
         """See ``MapEvidence``."""
         if self._aligned(tail, head, tail_T_head):
             return Decision.AGREES
-        maps = {vertex: self._maps[vertex] for vertex in self._maps if vertex.robot in (tail.robot, head.robot)}
+        # A map may be heard of before the edge that leads to its vertex.
+        known = {v for end in (tail, head) for v in self._joint.robots[end.robot].vertices()}
+        maps = {vertex: self._maps[vertex] for vertex in self._maps if vertex in known}
         state = tuple(id(surface) for surface in maps.values())
         answers = self._answers.setdefault((tail, head), [])
         for before, pose, answer in answers:
