@@ -109,7 +109,7 @@ class Lookup:
         else:
             distance = np.full(grid.log_odds.shape, np.inf)
         kinds = np.where(known, _OTHER, _UNKNOWN).astype(np.uint8)
-        kinds[(grid.log_odds < FREE) & (distance > CLEAR)] = _CLEAR
+        kinds[(grid.log_odds <= FREE) & (distance > CLEAR)] = _CLEAR
         kinds[distance <= NEAR] = _SURFACE
         step = -(-len(local_map.cloud) // _MOST_POINTS) or 1
         rows, columns = np.nonzero(known[::_AREA_STEP, ::_AREA_STEP])

@@ -94,10 +94,6 @@ class Topology:
             self.past.append(EdgeFate(old, "replaced", f"by version {edge.version}"))
         self.edges[edge.id] = edge
 
-    def refuse(self, edge: Edge, reason: str) -> None:
-        """Remember an edge that was not entered, and why."""
-        self.past.append(EdgeFate(edge, "refused", reason))
-
     def between(self, a: VertexId, b: VertexId) -> Edge | None:
         """The edge that joins two vertices, in either direction."""
         return next((e for e in self.edges.values() if {e.tail, e.head} == {a, b}), None)

@@ -27,14 +27,16 @@ class Evidence:
 
     def __init__(self, maps: Mapping[VertexId, Surface], joint: JointMap, aligner: Aligner) -> None:
         self._maps, self._joint, self._aligner = maps, joint, aligner
-        self._answers: dict[tuple[VertexId, VertexId], list[tuple[tuple[int, ...], gtsam.Pose2, Decision]]] = {}
+        self._answers: dict[tuple[VertexId, VertexId], list[tuple[tuple[Surface, ...], gtsam.Pose2, Decision]]] = {}
 
     def __call__(self, tail: VertexId, head: VertexId, tail_T_head: UncertainPose) -> Decision:
         """See ``MapEvidence``."""
         if self._aligned(tail, head, tail_T_head):
             return Decision.AGREES
-        maps = {vertex: self._maps[vertex] for vertex in self._maps if vertex.robot in (tail.robot, head.robot)}
-        state = tuple(id(surface) for surface in maps.values())
+        # A map may be heard of before the edge that leads to its vertex.
+        known = {v for end in (tail, head) for v in self._joint.robots[end.robot].vertices()}
+        maps = {vertex: self._maps[vertex] for vertex in self._maps if vertex in known}
+        state = tuple(maps.values())
         answers = self._answers.setdefault((tail, head), [])
         for before, pose, answer in answers:
             if before == state and (np.abs(gtsam.Pose2.Logmap(pose.between(tail_T_head.pose))) < SAME).all():

@@ -208,7 +208,7 @@ def _run(robot: Robot, story: _Story, stages: Stages) -> MemberRun:
         times=times,
         vertices=inside,
         poses=poses,
-        local_maps={v.id: local_map_of(v, times) for v in robot.topology.vertices},
+        local_maps={v.id: local_map_of(v, times) for v in robot.topology.vertices if v.maps is not None},
         past=robot.topology.past,
         events=story.events,
         seconds=stages.seconds,

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from factors import VertexId
+from factors import VertexId, edge_from_dict
+from mrtm.evaluation import evaluate_output
 from mrtm.joint.hypotheses import Hypothesis
 from mrtm.output.export import export
 from mrtm.output.report import run_report
@@ -24,6 +25,7 @@ from mrtm.team.records import AnchorRecord, Kind
 from mrtm.team.store import Store
 from tests.mrtm.sighting_world import TeamWorld
 from tests.mrtm.team_world import BETWEEN, NO_MAPS, chain, run_of, timed
+from tools.simulation import write_tum
 
 Moments = list[tuple[float, Hypothesis]]
 
@@ -283,6 +285,33 @@ def test_progress_is_told_and_stays_within_bounds() -> None:
 
 
 # What run.json says.
+
+
+def test_a_team_without_headings_is_exported_evaluated_and_told(tmp_path: Path) -> None:
+    """Its edges of single ranges and bearings have no pose and no 3 x 3 covariance."""
+    world = chain(2, 3, sightings=9, headings=False)
+    result = played(world)
+    assert len(result.components) == 1
+    kinds = [str(fate.edge.kind) for fate in result.edges if fate.fate == "accepted"]
+    assert "sighting" in kinds
+    export(result, tmp_path)
+    entries = json.loads((tmp_path / "run.json").read_text())["edges"]
+    assert [e["kind"] for e in entries if e["fate"] == "accepted"] == kinds
+    seen = next(e for e in entries if e["kind"] == "sighting")
+    assert edge_from_dict(seen).to_dict()["range_bearing"] == seen["range_bearing"]
+    for name, trajectory in result.trajectories.items():
+        root = world.truth[VertexId(name, 0)]
+        true = [root.compose(root.between(world.truth[VertexId(name, int(i))])) for i in trajectory.vertices]
+        write_tum(trajectory.times, np.array([[p.x(), p.y(), p.theta()] for p in true]), tmp_path / f"{name}.tum")
+    evaluation = evaluate_output(tmp_path, truth={name: tmp_path / f"{name}.tum" for name in world.names})
+    (ate,) = evaluation.ate
+    assert ate.translation.rmse < 1.0
+    assert evaluation.edges is not None
+    assert set(evaluation.edges) == set(kinds) - {"sighting"}
+    console = Console(width=120, record=True, file=io.StringIO())
+    for part in run_report(result):
+        console.print(part)
+    assert "sighting" in console.export_text()
 
 
 def test_run_json_tells_meetings_and_fates(tmp_path: Path) -> None:

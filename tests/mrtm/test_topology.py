@@ -88,15 +88,6 @@ def test_a_new_version_takes_the_place_of_the_old_one_which_becomes_history() ->
     assert topology.between(a.id, b.id) is newer[1]
 
 
-def test_a_refused_edge_is_remembered_with_its_reason_and_joins_nothing() -> None:
-    topology = Topology("red")
-    a, b = topology.new_vertex(), topology.new_vertex()
-    edge = topology.new_edge(EdgeKind.LOOP, a.id, b.id, UncertainPose(gtsam.Pose2(), np.eye(3)))
-    topology.refuse(edge, "does not fit")
-    assert [(f.edge, f.fate, f.reason) for f in topology.past] == [(edge, "refused", "does not fit")]
-    assert topology.between(a.id, b.id) is None
-
-
 def test_a_vertex_seen_from_itself_is_at_the_origin_without_doubt(rng: np.random.Generator) -> None:
     topology, _ = chain(rng, STEPS, 0.05)
     here = topology.along_shortest_paths(topology.vertices[2].id)[topology.vertices[2].id]
