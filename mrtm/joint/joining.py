@@ -11,7 +11,7 @@ from frontend import se2
 from mrtm.joint.common_frame import CommonFrame, examine, solve
 from mrtm.joint.hypotheses import BoolArray, FloatArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
 from mrtm.joint.innovation import gates
-from mrtm.joint.pairs import LEAST_SUPPORT, Evidence, Finding, find, outnumbers
+from mrtm.joint.pairs import LEAST_SUPPORT, Evidence, Finding, Proposed, find, outnumbers
 
 Pair = tuple[str, str]
 
@@ -63,10 +63,16 @@ class Joining:
         self.rows = {pair: np.array(members[pair], np.int64) for pair in sorted(members)}
         self.findings: dict[Pair, Finding] = {}
         for pair, rows in self.rows.items():
-            sightings = self._among(pair, rows)
-            self.findings[pair] = find(self._maps[pair[0]], self._maps[pair[1]], sightings, evidence)
+            self.findings[pair] = find(self._proposed(pair, rows, slack), evidence)
         self.contradicting: dict[Pair, bool] = {}
         self._settle(self._span())
+
+    def _proposed(self, pair: Pair, rows: IntArray, slack: Slack) -> Proposed:
+        """What the sightings of a pair propose, seen by the vertices that these have to do with."""
+        hypotheses = tuple(self._hypotheses[row] for row in rows.tolist())
+        ends = [vertex for h in hypotheses for vertex in (h.observer, h.observed)]
+        a, b = (self._maps[robot].among(v for v in ends if v.robot == robot) for robot in pair)
+        return Proposed.of(a, b, hypotheses, slack)
 
     def within(self, slack: Slack) -> BoolArray:
         """(n,) which sightings would fit where they are believed not to, if the poses were uncertain by ``slack``."""
@@ -136,8 +142,8 @@ class Joining:
             if groups[a] is groups[b]:
                 closing.append((a, b))
                 continue
-            own = self._maps[b]
-            a_T_b = se2.compose(joined[a, b].frame.poses[-len(own.vertices)], se2.inverse(own.poses[0]))
+            root, own = self.findings[a, b].root, self._maps[b]
+            a_T_b = se2.compose(joined[a, b].frame.poses[root], se2.inverse(own.poses[0]))
             shift = se2.compose(se2.compose(at[a], a_T_b), se2.inverse(at[b]))
             for robot in groups[b]:
                 at[robot] = se2.compose(shift, at[robot])

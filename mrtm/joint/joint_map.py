@@ -7,6 +7,7 @@ import gtsam
 
 from factors import Edge, EdgeId, GraphEdge, VertexId
 from mrtm.joint.graph import GraphError, JointGraph
+from mrtm.joint.own_graph import own_graph, refusal
 
 
 @dataclass(slots=True)
@@ -37,9 +38,8 @@ class JointMap:
 
     def __init__(self) -> None:
         self.refused: dict[EdgeId, str] = {}
-        self._refused: dict[EdgeId, int] = {}  # their versions
+        self._edges: dict[str, dict[EdgeId, Edge]] = {}  # the highest version of each robot's own
         self._own: dict[str, JointGraph] = {}
-        self._unconnected: dict[EdgeId, Edge] = {}
         self._component: dict[str, Component] = {}
 
     @property
@@ -70,47 +70,35 @@ class JointMap:
         Args:
             robots: names of robots heard of; one with a single vertex has no edge.
         """
-        waiting = self._unconnected
+        changed = {robot for robot in robots if robot not in self._own}
         for edge in edges:
-            before = waiting[edge.id].version if edge.id in waiting else self._refused.get(edge.id, -1)
-            if edge.version > before:
-                waiting[edge.id] = edge
-        for robot in {*robots, *(edge_id.robot for edge_id in waiting)} - self._own.keys():
-            self._own[robot] = JointGraph(VertexId(robot, 0))
-            self._apart([robot])
-        for robot in sorted({edge_id.robot for edge_id in waiting}):
-            self._enter(robot, [edge for edge_id, edge in sorted(waiting.items()) if edge_id.robot == robot])
+            known = self._edges.setdefault(edge.id.robot, {})
+            if edge.id not in known or edge.version > known[edge.id].version:
+                known[edge.id] = edge
+                changed.add(edge.id.robot)
+        for robot in sorted(changed):
+            self._enter(robot)
 
-    def _enter(self, robot: str, edges: Iterable[Edge]) -> None:
-        """Enter those of a robot's waiting edges that are connected to its root."""
-        own, component = self._own[robot], self._component[robot]
-        known, present = set(own.vertices()), {edge.id: edge.version for edge in own.edges()}
-        replace = [edge for edge in edges if edge.id in present]
-        new = [edge for edge in edges if edge.id not in present]
-        add: list[Edge] = []
-        while reached := [edge for edge in new if edge.tail in known or edge.head in known]:
-            known |= {end for edge in reached for end in (edge.tail, edge.head)}
-            add += reached
-            new = [edge for edge in new if edge not in reached]
-        for edge in (*add, *replace):
-            del self._unconnected[edge.id]
-        replace = [edge for edge in replace if edge.version > present[edge.id]]
-        change = [*add, *replace]
-        try:
-            _check_ends(robot, change)
-            own.update(add=add, replace=replace)
-        except GraphError as error:
-            for edge in change if len(change) > 1 else ():  # one by one: which is it?
-                self._unconnected[edge.id] = edge
-                self._enter(robot, [edge])
-            if len(change) == 1:
-                self._refuse(change[0], error)
+    def _enter(self, robot: str) -> None:
+        """Solve a robot's edges, and bring its component up to date."""
+        edges = tuple(edge for _, edge in sorted(self._edges.get(robot, {}).items()))
+        before = self._own.get(robot)
+        self._own[robot], refused = own_graph(robot, edges)
+        self.refused = {i: why for i, why in self.refused.items() if i not in self._edges.get(robot, {})} | refused
+        if before is None or self._component[robot].graph is before:
+            self._apart([robot])
             return
-        if change and component.graph is not own:
-            try:
-                component.graph.update(add=add, replace=replace)
-            except GraphError:
-                self._apart(component.robots)  # ``join`` makes it anew
+        component = self._component[robot]
+        was, now = ({edge.id: edge for edge in graph.edges()} for graph in (before, self._own[robot]))
+        try:
+            component.graph.update(
+                add=[edge for i, edge in now.items() if i not in was],
+                replace=[edge for i, edge in now.items() if i in was and edge.version > was[i].version],
+                remove=[i for i in was if i not in now],
+                remove_vertices=set(before.vertices()) - set(self._own[robot].vertices()),
+            )
+        except GraphError:
+            self._apart(component.robots)  # ``join`` makes it anew
 
     def join(self, added: Iterable[GraphEdge]) -> None:
         """Let ``added`` be all the edges beside the robots' own (M11, M13): robots come into one frame, or fall apart.
@@ -137,8 +125,7 @@ class JointMap:
                 self._component.update(dict.fromkeys(robots, component))
 
     def _refuse(self, edge: GraphEdge, error: GraphError) -> None:
-        self.refused[edge.id] = f"{edge}: refused: {error}"
-        self._refused[edge.id] = edge.version
+        self.refused[edge.id] = refusal(edge, error)
 
     def _apart(self, robots: Iterable[str]) -> None:
         """Let every robot have its own map."""
@@ -184,12 +171,6 @@ def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
     if replace or gone:
         component.graph.update(replace=replace, remove=gone)
     component.added = added
-
-
-def _check_ends(robot: str, edges: Iterable[Edge]) -> None:
-    for edge in edges:
-        if _ends(edge) != {robot}:
-            raise GraphError(f"a robot's own edges join its own vertices, not those of {edge.tail} and {edge.head}")
 
 
 def _ends(edge: GraphEdge) -> set[str]:

@@ -74,8 +74,7 @@ class _Playback:
             report(number / len(meetings))
         for _, record in told:
             self._write_down(record)
-        for teammate in (*(self._team.values() if len(self._team) > 1 else ()), self._listener):
-            teammate.settle()
+        self._listener.settle()
 
     def _write_down(self, record: Record) -> None:
         with self._stages("exchange"):
@@ -90,7 +89,6 @@ class _Playback:
             traffic = exchange(one.store, other.store)
         for teammate in (one, other):
             teammate.think()
-            teammate.align()
             for robot in teammate.joint.robots.keys() & {teammate.name}:  # none if it has not taken a scan yet
                 self._frames.append((time, frozenset(teammate.joint.component(robot).robots)))
         verdict, reason = _verdict(one, robots)
