@@ -138,6 +138,10 @@ class Store:
                 assert isinstance(record, kind)
                 yield record
 
+    def count(self, kind: type[R]) -> int:
+        """How many records of one type there are."""
+        return sum(len(self.part(robot, kind.kind)) for robot in self._items)
+
     def part(self, robot: str, kind: Kind) -> tuple[Item, ...]:
         """The items of one writer and kind, by number."""
         name = robot, kind

@@ -81,7 +81,7 @@ class Teammate:
         self._evidence = Evidence(self._maps, self.joint, peers.answers)
         self._fusing: dict[EdgeId, Edge | SightingEdge] = {}
         self._told: dict[Key, int] = {}  # version of each record that the joint map knows
-        self._judged = 0  # how many records were known when sightings were last judged
+        self._judged = 0, 0  # how many records, and sightings, were known when these were last judged
 
     def judgements_between(self, robots: tuple[str, str]) -> dict[HypothesisId, Judgement]:
         """The judgements of sightings between two robots."""
@@ -92,15 +92,16 @@ class Teammate:
     def think(self) -> None:
         """Bring the joint map up to date with the records.
 
-        Sightings are judged again, and maps aligned, when there is a share of GROWN more to go by: so that all the
-        judging of a growing store takes a fixed number of times as long as the last.
+        Sightings are judged again, and maps aligned, when there are GROWN times as many records or sightings to go by:
+        so all the judging of a growing store takes a fixed number of times as long as the last.
         """
         robots = {record.id.robot for record in self._news(VertexRecord)}
         edges = [record.edge for record in self._news(EdgeRecord)]
         with self._stages("joint map"):
             self.joint.learn(edges, robots)
-        if len(self.store) >= GROWN * self._judged:
-            self._judged = len(self.store)
+        held = len(self.store), self.store.count(SightingRecord)
+        if any(now >= GROWN * before for now, before in zip(held, self._judged, strict=True) if now):
+            self._judged = held
             self._fuse()
             self.align()
 
