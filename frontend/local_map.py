@@ -48,6 +48,8 @@ class LocalMap:
 def contents(maps: Maps) -> tuple[Grid, FloatArray, FloatArray]:
     """Grid, cloud (m, 2) and normals (m, 2), as of ``LocalMap``, of the first map of a stack."""
     log_odds, corner = maps.known(0)
+    if not log_odds.size:  # a blind laser leaves nothing: one unknown cell
+        log_odds = np.zeros((1, 1), np.int8)
     surfels = maps.surfels[0, 1 : maps.counts[0]].astype(np.float64)
     surfels = surfels[surfels[:, N] > 0]
     normals = surfels[:, NX : NY + 1]

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from frontend import motion, se2
 from frontend.grid import Maps
@@ -10,7 +11,7 @@ from frontend.parameters import FilterParameters
 from frontend.points import Points, merge
 from frontend.rbpf import ParticleFilter
 from frontend.records import FloatArray
-from frontend.refine import refine
+from frontend.refine import localise, refine
 from frontend.tracking import REVERSED, Step
 
 PATIENCE = 2.5  # times the usual distance between key scans
@@ -24,14 +25,19 @@ class Visit:
 
     Attributes:
         poses: (n, 3) local_T_robot at each of its scans.
-        covariance: (3, 3) of the last pose, in the robot's tangent frame.
-        spread: the part of it that the particles knew of.
+        chosen: (m,) indices of those poses whose covariance is known; the first and the last are.
+        covariances: (m, 3, 3) of each, in its own tangent frame: in the map as the visit found it or, if it found
+            none, from the first pose on.
+        sigma: metres; how far endpoints scattered about the map, as if independent.
+        spread: (3, 3) covariance of the particles at the end.
         maps: the vertex's map, a stack of one.
         since_resampling: key scans since the filter last resampled, of all of the visit's if it did not.
     """
 
     poses: FloatArray
-    covariance: FloatArray
+    chosen: npt.NDArray[np.int64]
+    covariances: FloatArray
+    sigma: float
     spread: FloatArray
     maps: Maps
     since_resampling: int
@@ -52,6 +58,7 @@ class LocalSlam:
         self._base: Maps | None = None
         self._mapping = True
         self._entrance = np.zeros(3)
+        self._localised = np.empty((0, 3))  # poses of the first scans as ``entrance`` found them
         self._random = np.random.default_rng(seed)
 
     def begin(
@@ -70,6 +77,7 @@ class LocalSlam:
         self.filter.start(poses, known)
         self._points, self._increments = [points], [np.zeros(3)]
         self._offsets, self._keys, self._steps, self._resampled = [np.zeros(3)], [0], 0, 0
+        self._localised = np.empty((0, 3))
         if self._mapping:
             self.filter.insert(points, poses)
 
@@ -116,15 +124,30 @@ class LocalSlam:
             self._update(self._points[-1])
             self._offsets[-1] = np.zeros(3)
             self._keys[-1] = self._steps
-        covariance = self.covariance()
-        increments = np.array(self._increments)
-        variances = np.array([motion.variance(i, self.parameters.motion) for i in increments])
-        poses, maps = refine(self._points, self.path(), increments, variances, self._base, self.parameters)
+        increments, variances = self._odometry()
+        path = self.path()
+        path[: len(self._localised)] = self._localised
+        a, maps = refine(self._points, path, increments, variances, self._base, self.parameters)
         _, spread = self.filter.pose_and_covariance()
-        return Visit(poses, covariance, spread, maps, self._steps - self._resampled)
+        since = self._steps - self._resampled
+        return Visit(a.poses, a.chosen, a.covariances, a.sigma, spread, maps, since)
+
+    def entrance(self) -> tuple[FloatArray, FloatArray]:
+        """Pose (3,) of the visit's first scan in the known map, as all scans so far tell it, and its covariance (3, 3)
+        there, in its tangent frame."""
+        assert self._base is not None
+        increments, variances = self._odometry()
+        a = localise(self._points, self.path(), increments, variances, self._base, self.parameters)
+        self._localised = a.poses
+        return a.poses[0], a.covariances[0]
+
+    def _odometry(self) -> tuple[FloatArray, FloatArray]:
+        """(n, 3) increments and their variances."""
+        increments = np.array(self._increments)
+        return increments, np.array([motion.variance(i, self.parameters.motion) for i in increments])
 
     def covariance(self) -> FloatArray:
-        """(3, 3) of the robot's pose in the vertex, in the robot's tangent frame.
+        """(3, 3) of the robot's pose in the vertex so far, in the robot's tangent frame.
 
         What the particles know, and what they cannot know: the slow bending of the map they all share, which grows with
         the distance from where the visit began.

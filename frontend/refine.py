@@ -1,8 +1,8 @@
 """What a finished local map can still give to the poses it was made of.
 
 Inside a vertex a pose is only as good as the filter was at that time, with half a map. Once the map is whole, every
-scan is matched against it again and the matches are tied together by odometry, the map is drawn anew from the better
-poses, and so on.
+scan is matched against it again and the matches are tied together by odometry; then poses and map are adjusted
+together, and the map is drawn anew from the better poses.
 """
 
 import math
@@ -11,29 +11,34 @@ import numpy as np
 from numba import njit, prange
 
 from frontend import se2
+from frontend.adjust import Adjusted, adjust
 from frontend.grid import TILE, Maps, at, insert
 from frontend.matching import match
 from frontend.parameters import FilterParameters
 from frontend.points import Points
 from frontend.records import FloatArray
 
-ROUNDS = 2  # of drawing the map and matching against it
+ROUNDS = 3  # of drawing the map and matching against it, at most
+SETTLED = 0.02  # metres: no further round if no pose moved more
 LEASH = np.diag([1.0 / 0.05**2, 1.0 / 0.05**2, 1.0 / 0.03**2])  # information that keeps a match near where it starts
 TAIL = 9.0  # squared Mahalanobis distance at which odometry has half its weight
 SMOOTHING_STEPS = 3  # Gauss-Newton steps
+JUMP, JUMP_CHI2 = 0.1, 30.0  # metres, and squared Mahalanobis distance, from odometry that make a jump
+TOLERANCE = 0.03  # fit that a path may lose by having no jump
 DRAW_DISTANCE = 0.10  # metres or
 DRAW_ANGLE = 0.10  # radians between the scans that the map is drawn from
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _match_all(log_odds, index, surfels, resolution, hits, ends, poses, information, sigma, hessians):  # type: ignore[no-untyped-def]  # fmt: skip
+def _match_all(log_odds, index, surfels, resolution, hits, ends, poses, information, sigma, hessians, fits):  # type: ignore[no-untyped-def]  # fmt: skip
     for i in prange(len(poses)):
         first = ends[i - 1] if i else 0
         scan = hits[first : ends[i]]
         prior = poses[i].copy()
-        match(
+        fit, near, free, _ = match(
             log_odds, index, surfels, resolution, scan, poses[i], prior, information, sigma, hessians[i]
         )  # fmt: skip
+        fits[i] = fit / max(1, near + free)
 
 
 @njit(cache=True, nogil=True)
@@ -171,7 +176,7 @@ class _Packed:
 def refine(
     points: list[Points], poses: FloatArray, increments: FloatArray, variances: FloatArray, base: Maps | None,
     parameters: FilterParameters,
-) -> tuple[FloatArray, Maps]:  # fmt: skip
+) -> tuple[Adjusted, Maps]:  # fmt: skip
     """Better poses for the scans of one visit to a vertex, and the vertex's map drawn from them.
 
     Args:
@@ -183,40 +188,85 @@ def refine(
             first pose keeps its place.
 
     Returns:
-        (n, 3) poses and the map, a stack of one.
+        poses with their covariances in the map as it was, or from the first pose on, and the new map, a stack of one.
     """
     packed = _Packed(points)
     origin = poses[0]
     # What is known already is not drawn at first: a visit that began a little off would agree with itself.
     maps = _drawn(base, packed, poses, parameters, only_new=True)
     for _ in range(ROUNDS):
-        matched, hessians = _matches(maps, packed, poses, parameters)
-        poses = _smoothed(matched, hessians, increments, variances)
+        before = poses
+        poses = _matched(maps, packed, poses, increments, variances, parameters)
         if base is None:
             poses = se2.compose(origin, se2.between(poses[0], poses))
-        maps = _drawn(base, packed, poses, parameters)
+        maps = _drawn(base, packed, poses, parameters, only_new=True)
+        if np.abs(poses - before)[:, :2].max() < SETTLED:
+            break
     poses[:, 2] = se2.wrap(poses[:, 2])
-    return poses, maps
+    known = 0 if base is None else int(base.counts[0])
+    adjusted = adjust(packed.hits, packed.ends, poses, increments, variances, maps, known, parameters.sigma)
+    return adjusted, _drawn(base, packed, adjusted.poses, parameters)
+
+
+def localise(
+    points: list[Points], poses: FloatArray, increments: FloatArray, variances: FloatArray, known: Maps,
+    parameters: FilterParameters,
+) -> Adjusted:  # fmt: skip
+    """Better poses for scans in a ``known`` map (a stack of one), which stays as it is; else as ``refine``."""
+    packed = _Packed(points)
+    poses = _without_jumps(known, packed, poses, increments, variances, parameters)
+    for _ in range(ROUNDS):
+        before = poses
+        poses = _matched(known, packed, poses, increments, variances, parameters)
+        if np.abs(poses - before)[:, :2].max() < SETTLED:
+            break
+    poses[:, 2] = se2.wrap(poses[:, 2])
+    return adjust(packed.hits, packed.ends, poses, increments, variances, known, int(known.counts[0]), parameters.sigma)
 
 
 def _matches(
     maps: Maps, packed: _Packed, poses: FloatArray, parameters: FilterParameters
-) -> tuple[FloatArray, FloatArray]:
-    """Every scan against the map: poses (n, 3) and their informations (n, 3, 3)."""
-    matched, hessians = poses.copy(), np.empty((len(poses), 3, 3))
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The first n scans against the map: poses (n, 3), their informations (n, 3, 3) and fits (n,)."""
+    matched, hessians, fits = poses.copy(), np.empty((len(poses), 3, 3)), np.empty(len(poses))
     _match_all(
         maps.log_odds[0], maps.index[0], maps.surfels[0], maps.resolution,
-        packed.hits, packed.ends, matched, LEASH, parameters.sigma, hessians,
+        packed.hits, packed.ends, matched, LEASH, parameters.sigma, hessians, fits,
     )  # fmt: skip
-    return matched, hessians
+    return matched, hessians, fits
 
 
-def _smoothed(matched: FloatArray, hessians: FloatArray, increments: FloatArray, variances: FloatArray) -> FloatArray:
-    """The chain of poses that best agrees with the matches and with odometry."""
-    informations = hessians + 1e-3 * np.eye(3)
+def _without_jumps(
+    known: Maps, packed: _Packed, poses: FloatArray, increments: FloatArray, variances: FloatArray,
+    parameters: FilterParameters,
+) -> FloatArray:  # fmt: skip
+    """Poses (n, 3) in a known map without the jumps of a robot that at first took itself to be a little off.
+
+    The part before a jump is moved to where odometry has it, seen from the part after it, unless the map objects.
+    """
+    off = se2.between(se2.compose(poses[:-1], increments[1:]), poses[1:])
+    doubtful = (np.hypot(off[:, 0], off[:, 1]) > JUMP) & ((off**2 / variances[1:]).sum(axis=1) > JUMP_CHI2)
+    for last in np.flatnonzero(doubtful)[::-1]:
+        part = poses[: last + 1]
+        moved = se2.compose(
+            se2.compose(poses[last + 1], se2.inverse(increments[last + 1])), se2.between(part[-1], part)
+        )
+        (_, _, before), (found, _, after) = (_matches(known, packed, p, parameters) for p in (part, moved))
+        if after.mean() > before.mean() - TOLERANCE:
+            poses = np.concatenate([found, poses[last + 1 :]])
+    return poses
+
+
+def _matched(
+    maps: Maps, packed: _Packed, poses: FloatArray, increments: FloatArray, variances: FloatArray,
+    parameters: FilterParameters,
+) -> FloatArray:  # fmt: skip
+    """Every scan matched against the map, and the chain (n, 3) that best agrees with the matches and with odometry."""
+    matched, hessians, _ = _matches(maps, packed, poses, parameters)
+    hessians += 1e-3 * np.eye(3)
     poses = matched
     for _ in range(SMOOTHING_STEPS):
         result = np.empty_like(poses)
-        _smooth(poses, matched, informations, increments, variances, result)
+        _smooth(poses, matched, hessians, increments, variances, result)
         poses = result
     return poses

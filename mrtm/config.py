@@ -52,7 +52,7 @@ class TopologyParameters(Section):
             "chi2 of a re-entry against the joint map above which it is refused; more where the place stands out",
             gt=0,
         ),
-    ] = 12.0
+    ] = 24.0
     trial_lead: Annotated[float, Parameter("", "by which one place must beat all others", ge=0, le=1)] = 0.05
 
 

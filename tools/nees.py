@@ -45,6 +45,7 @@ def main(
     os.environ["NUMBA_NUM_THREADS"] = "1"  # for this process, which imports numba below, and for its children
     from frontend.errors import FrontendError
     from mrtm.errors import MrtmError
+    from tools.bench.machine import setting
     from tools.honesty.runs import finished, logged, simulated
     from tools.honesty.tables import tables
     from tools.simulation import BUILDINGS, SimulationError
@@ -74,8 +75,10 @@ def main(
         console.print(table.rich())
     out.mkdir(parents=True, exist_ok=True)
     what = f"{seeds} seeds from {first_seed}, {laps} laps" + "".join(f", {option}" for option in given)
+    here = setting()
+    made = f"commit {here.commit}, {here.day.isoformat()}\n"
     text = "\n".join(table.markdown() for table in found)
-    (out / "nees.md").write_text(f"# Honesty of covariances\n\n{what}\n\n{text}", encoding="utf-8")
+    (out / "nees.md").write_text(f"# Honesty of covariances\n\n{what}\n\n{made}\n{text}", encoding="utf-8")
     samples = [sample for one in runs for sample in one.samples]
     if samples:
         from tools.honesty.figure import draw

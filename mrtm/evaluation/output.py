@@ -133,7 +133,7 @@ def _edge_honesty(run: RunFile, frames: dict[_Name, FloatArray]) -> dict[str, Ho
     kinds: dict[str, list[tuple[Any, Any, Any]]] = {}
     for edge in run["edges"]:
         tail, head = edge["tail"], edge["head"]
-        if edge["fate"] == "accepted" and tail in frames and head in frames:
+        if edge["fate"] == "accepted" and "measurement" in edge and tail in frames and head in frames:
             true = se2.between(frames[tail], frames[head])
             kinds.setdefault(edge["kind"], []).append((true, edge["measurement"], edge["covariance"]))
     return {kind: _honesty(*map(list, zip(*rows, strict=True))) for kind, rows in kinds.items()}

@@ -54,8 +54,8 @@ class EdgeEntry(TypedDict):
     head: _Name
     kind: str
     fate: str
-    measurement: _Three
-    covariance: _Covariance
+    measurement: NotRequired[_Three]  # a range and bearing has neither
+    covariance: NotRequired[_Covariance]
 
 
 class MeetingEntry(TypedDict):

@@ -67,7 +67,7 @@ CLEAR = 0.25
 """A free cell is clearly free only so far, metres, from any surface."""
 
 FREE = -1.5
-"""Log-odds below which a cell is free."""
+"""Log-odds down from which a cell is free: those of a free cell of a map that has travelled (FREE_VOTE)."""
 
 UNKNOWN = 0.01
 """Log-odds up to here are what rounding leaves of nothing."""
@@ -108,7 +108,7 @@ class Lookup:
         else:
             distance = np.full(grid.log_odds.shape, np.inf)
         kinds = np.where(known, _OTHER, _UNKNOWN).astype(np.uint8)
-        kinds[(grid.log_odds < FREE) & (distance > CLEAR)] = _CLEAR
+        kinds[(grid.log_odds <= FREE) & (distance > CLEAR)] = _CLEAR
         kinds[distance <= NEAR] = _SURFACE
         step = -(-len(local_map.cloud) // _MOST_POINTS) or 1
         rows, columns = np.nonzero(known[::_AREA_STEP, ::_AREA_STEP])

@@ -158,7 +158,9 @@ class Aligner:
         old = self.attempts.get(pair)
         if old is None or not _unchanged(old, maps):
             return True
-        return _moved(old, guess.pose) > MOVED or np.linalg.det(old.guess.covariance) > SURER**2 * np.linalg.det(guess.covariance)
+        return _moved(old, guess.pose) > MOVED or np.linalg.det(old.guess.covariance) > SURER**2 * np.linalg.det(
+            guess.covariance
+        )
 
     def _try(self, pair: Pair, maps: tuple[Surface, Surface], guess: UncertainPose) -> None:
         found = self._align(*maps, guess)

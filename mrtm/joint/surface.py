@@ -45,7 +45,7 @@ class Surface:
         normals = np.ascontiguousarray(local_map.normals[known], np.float64)
         scatter = normals.T @ normals / max(1, len(normals))
         grid = local_map.grid
-        free = np.count_nonzero(grid.log_odds < FREE) * grid.resolution
+        free = np.count_nonzero(grid.log_odds <= FREE) * grid.resolution
         width = free / max(1, len(local_map.cloud))
         return cls(points, normals, cKDTree(points), scatter, width, Lookup.of(local_map))
 

@@ -18,7 +18,7 @@ from frontend.records import FloatArray
 from frontend.relocalisation import hypotheses
 from frontend.tracking import Step
 from mrtm.config import TopologyParameters
-from mrtm.robot.poses import array_of, exactly, innovation, pose_of
+from mrtm.robot.poses import array_of, exactly, innovation
 from mrtm.robot.topology import Vertex
 
 SUBMAP_SCANS = 12  # taken together to confirm a re-entry
@@ -135,7 +135,7 @@ class Trial:
 
     def entered(self, slam: LocalSlam) -> UncertainPose:
         """The robot's pose in the old vertex at the scan where the trial began."""
-        return UncertainPose(pose_of(slam.path()[0]), slam.covariance())
+        return self.candidate.vertex.uncertain(*slam.entrance())
 
     def _confirm(self, slam: LocalSlam, p: TopologyParameters) -> tuple[float, float]:
         """Search the whole of the projected covariance again, with all that the trial has seen so far as one scan.

@@ -1,6 +1,7 @@
 """One robot's TM-SLAM: steps M1 to M8, scan by scan."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -120,13 +121,25 @@ class Robot:
         with self._stages("closing"):
             visit = self._slam.finish()
         here = self._here
+        chosen = [
+            here.uncertain(pose, covariance)
+            for pose, covariance in zip(visit.poses[visit.chosen], visit.covariances, strict=True)
+        ]
         here.maps, here.spread = visit.maps, visit.spread
         here.scans.extend(range(self._first, self._first + len(visit.poses)))
         here.poses.extend(visit.poses)
-        self._tell("left vertex", vertex=str(here.id), scans=len(visit.poses), since_resampling=visit.since_resampling)
-        self._update_edge(UncertainPose(pose_of(visit.poses[0]), visit.covariance))
-        self._visited(here, self._first, visit)
-        return UncertainPose(pose_of(visit.poses[-1]), visit.covariance)
+        known = np.array([pose.covariance for pose in chosen])
+        here.drawn_from(visit.poses[visit.chosen], known)
+        self._tell(
+            "left vertex",
+            vertex=str(here.id),
+            scans=len(visit.poses),
+            since_resampling=visit.since_resampling,
+            sigma=round(visit.sigma, 5),
+        )
+        self._update_edge(chosen[0])
+        self._visited(here, self._first, replace(visit, covariances=known))
+        return chosen[-1]
 
     def _update_edge(self, entered: UncertainPose) -> None:
         """M5: the vertex was entered by a known edge and is well known now; fuse the edge with what was measured."""

@@ -7,9 +7,13 @@ import gtsam
 import numpy as np
 
 from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId, compose, inverse
+from frontend import se2
 from frontend.grid import Maps
 from frontend.records import FloatArray
 from mrtm.result import EdgeFate
+from mrtm.robot.poses import pose_of
+
+NEAR = 3.0  # metres: poses of a map nearer than this all tell about the same of its error
 
 
 @dataclass(slots=True)
@@ -20,6 +24,8 @@ class Vertex:
         id: name.
         maps: what is known of the place (a stack of one), as the last visit left it; None during the first visit.
         spread: (3, 3) covariance of the particles when the robot last left.
+        places: poses (k, 3) from which the map was made, and
+        covariances: (k, 3, 3) how well each is known in the frame of the vertex, each in its own tangent frame.
         scans: indices of the robot's scans taken here, in the order they came.
         poses: local_T_robot (3,) at each of them.
     """
@@ -27,8 +33,36 @@ class Vertex:
     id: VertexId
     maps: Maps | None = None
     spread: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+    places: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    covariances: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
     scans: list[int] = field(default_factory=list)
     poses: list[FloatArray] = field(default_factory=list)
+
+    def drawn_from(self, poses: FloatArray, covariances: FloatArray) -> None:
+        """Take note of poses (k, 3) with covariances (k, 3, 3) that the map was made from, where there was none yet."""
+        off = poses[:, None, :2] - self.places[None, :, :2]
+        new = (np.hypot(off[..., 0], off[..., 1]) > NEAR).all(axis=1)
+        self.places = np.concatenate([self.places, poses[new]])
+        self.covariances = np.concatenate([self.covariances, covariances[new]])
+
+    def uncertain(self, pose: FloatArray, covariance: FloatArray) -> UncertainPose:
+        """A pose (3,) known to ``covariance`` (3, 3) in the map, with the map's own error as seen from it added.
+
+        What is seen was drawn from all the poses the map was made from: their covariances, carried here, are averaged,
+        the nearer ones counting more.
+        """
+        if not len(self.places):
+            return UncertainPose(pose_of(pose), covariance)
+        here_T_place = se2.between(pose, self.places)
+        c, s = np.cos(here_T_place[:, 2]), np.sin(here_T_place[:, 2])
+        adjoint = np.zeros((len(c), 3, 3))
+        adjoint[:, 0, 0] = adjoint[:, 1, 1] = c
+        adjoint[:, 0, 1], adjoint[:, 1, 0] = -s, s
+        adjoint[:, 0, 2], adjoint[:, 1, 2] = here_T_place[:, 1], -here_T_place[:, 0]
+        adjoint[:, 2, 2] = 1.0
+        weights = 1.0 / (NEAR**2 + (here_T_place[:, :2] ** 2).sum(axis=1)) ** 2
+        carried = adjoint @ self.covariances @ np.transpose(adjoint, (0, 2, 1))
+        return UncertainPose(pose_of(pose), covariance + np.average(carried, axis=0, weights=weights))
 
 
 class Topology:
@@ -59,10 +93,6 @@ class Topology:
         if old is not None:
             self.past.append(EdgeFate(old, "replaced", f"by version {edge.version}"))
         self.edges[edge.id] = edge
-
-    def refuse(self, edge: Edge, reason: str) -> None:
-        """Remember an edge that was not entered, and why."""
-        self.past.append(EdgeFate(edge, "refused", reason))
 
     def between(self, a: VertexId, b: VertexId) -> Edge | None:
         """The edge that joins two vertices, in either direction."""

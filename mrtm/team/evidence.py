@@ -32,7 +32,9 @@ class Evidence:
             if before == state and (np.abs(gtsam.Pose2.Logmap(pose.between(tail_T_head.pose))) < SAME).all():
                 return answer
         maps = self._maps.of(tail.robot) | self._maps.of(head.robot)
-        lookups = {vertex: surface.lookup for vertex, surface in maps.items()}
+        # A map may be heard of before the edge that leads to its vertex.
+        known = {v for end in (tail, head) for v in self._joint.robots[end.robot].vertices()}
+        lookups = {vertex: surface.lookup for vertex, surface in maps.items() if vertex in known}
         found = MapEvidence(lookups, self._joint.robots)(tail, head, tail_T_head)
         answers.append((state, tail_T_head.pose, found))
         del answers[:-KEPT]

@@ -166,7 +166,8 @@ class _Story:
         for anchor in self._anchors:
             if first <= anchor.scan < first + len(visit.poses):
                 anchor.version = max(anchor.version, 0)  # what comes is refined, even if nothing was told before
-                pose = UncertainPose(pose_of(visit.poses[anchor.scan - first]), visit.covariance)
+                near = int(np.argmin(np.abs(visit.chosen - (anchor.scan - first))))
+                pose = UncertainPose(pose_of(visit.poses[anchor.scan - first]), visit.covariances[near])
                 self._tell_anchor(anchor, vertex.id, pose)
 
     def _tell_anchor(self, anchor: _Anchor, vertex: VertexId, at_scan: UncertainPose) -> None:
@@ -207,7 +208,7 @@ def _run(robot: Robot, story: _Story, stages: Stages) -> MemberRun:
         times=times,
         vertices=inside,
         poses=poses,
-        local_maps={v.id: local_map_of(v, times) for v in robot.topology.vertices},
+        local_maps={v.id: local_map_of(v, times) for v in robot.topology.vertices if v.maps is not None},
         past=robot.topology.past,
         events=story.events,
         seconds=stages.seconds,

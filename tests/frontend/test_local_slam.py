@@ -32,7 +32,7 @@ def visited(
 
 
 def same_bits(a: Visit, b: Visit) -> bool:
-    arrays = [(v.poses, v.covariance, v.maps.log_odds, v.maps.index, v.maps.surfels, v.maps.counts) for v in (a, b)]
+    arrays = [(v.poses, v.covariances, v.maps.log_odds, v.maps.index, v.maps.surfels, v.maps.counts) for v in (a, b)]
     return all(x.tobytes() == y.tobytes() for x, y in zip(*arrays, strict=True))
 
 
@@ -65,8 +65,8 @@ def test_a_visit_is_accurate_and_knows_how_much() -> None:
     assert np.hypot(off[:, 0], off[:, 1]).max() < 0.04
     assert np.abs(off[:, 2]).max() < math.radians(1.0)
     last = se2.log(off[-1])
-    assert last @ np.linalg.inv(visit.covariance) @ last < 16.3  # 0.999 of chi2, 3 degrees of freedom
-    assert np.sqrt(visit.covariance[0, 0]) < 0.1
+    assert last @ np.linalg.inv(visit.covariances[-1]) @ last < 16.3  # 0.999 of chi2, 3 degrees of freedom
+    assert np.sqrt(visit.covariances[-1, 0, 0]) < 0.1
     np.testing.assert_array_equal(visit.poses[0], 0.0)
     assert len(visit.poses) == 110
     assert 0 < visit.since_resampling < slam.filter.paths().shape[0]
@@ -164,7 +164,7 @@ def test_bad_scans_are_survived(kind: str, first: int) -> None:
     distances = np.hypot(off[:, 0], off[:, 1])
     assert distances.max() < (0.8 if kind == "noise" else 0.1)
     assert distances[-1] < 0.03
-    assert np.linalg.eigvalsh(visit.covariance).min() > 0
+    assert np.linalg.eigvalsh(visit.covariances[-1]).min() > 0
 
 
 @pytest.mark.parametrize("hits", [0, 1, 180])
@@ -174,7 +174,7 @@ def test_a_visit_of_one_scan(hits: int) -> None:
     slam.begin(Points(points.hits[:hits], points.clear, points.sensor), STILL)
     visit = slam.finish()
     np.testing.assert_allclose(visit.poses, np.zeros((1, 3)), atol=1e-12)
-    assert np.isfinite(visit.covariance).all()
+    assert np.isfinite(visit.covariances[-1]).all()
 
 
 @pytest.mark.parametrize("beams", [361, 1080])

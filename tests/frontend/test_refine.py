@@ -84,7 +84,8 @@ def test_the_poses_of_a_visit_get_better() -> None:
     points, true, increments, variances = visit(slice(0, 90))
     rough = np.vstack((true[:1], disturbed(true)[1:]))
     rough_before, hits_before = rough.copy(), [p.hits.copy() for p in points]
-    poses, maps = refine.refine(points, rough, increments, variances, None, PARAMETERS)
+    found, maps = refine.refine(points, rough, increments, variances, None, PARAMETERS)
+    poses = found.poses
     np.testing.assert_allclose(poses[0], true[0], atol=1e-12)
     before, after = errors(rough, true), errors(poses, true)
     assert after[0] < before[0] / 2
@@ -109,7 +110,8 @@ def test_a_known_map_holds_the_poses() -> None:
     variances = np.array([motion.variance(i, PARAMETERS.motion) for i in increments[:40]])
     rough = disturbed(true)
     rough[0] = se2.compose(true[0], np.array([0.04, -0.03, 0.01]))
-    poses, maps = refine.refine(points[:40], rough, increments[:40], variances, base, PARAMETERS)
+    found, maps = refine.refine(points[:40], rough, increments[:40], variances, base, PARAMETERS)
+    poses = found.poses
     assert errors(poses, true)[0] < 0.02 < errors(rough, true)[0] / 1.5
     assert np.hypot(*(poses[0] - true[0])[:2]) < 0.02
     assert maps.counts[0] >= base.counts[0] > 100
@@ -123,8 +125,8 @@ def test_scans_that_saw_nothing_are_carried_by_odometry() -> None:
     variances = np.array([motion.variance(i, PARAMETERS.motion) for i in increments])
     nothing = Points(points[0].hits[:0], points[0].clear[:0], points[0].sensor)
     blind = [nothing if 20 <= i < 26 or i == 59 else p for i, p in enumerate(points)]
-    poses, _ = refine.refine(blind, true, increments, variances, None, PARAMETERS)
-    assert errors(poses, true)[0] < 0.012
+    found, _ = refine.refine(blind, true, increments, variances, None, PARAMETERS)
+    assert errors(found.poses, true)[0] < 0.012
 
 
 @pytest.mark.parametrize("hits", [0, 1, 180])
@@ -132,7 +134,33 @@ def test_a_visit_of_one_scan(hits: int) -> None:
     (points,) = drive()[1][:1]
     few = Points(points.hits[:hits], points.clear, points.sensor)
     at = np.array([[0.2, 0.1, 3.0]])
-    poses, maps = refine.refine([few], at, np.zeros((1, 3)), np.full((1, 3), 1e-5), None, PARAMETERS)
-    np.testing.assert_allclose(poses, at, atol=1e-12)
+    found, maps = refine.refine([few], at, np.zeros((1, 3)), np.full((1, 3), 1e-5), None, PARAMETERS)
+    np.testing.assert_allclose(found.poses, at, atol=1e-12)
+    assert found.covariances.shape == (1, 3, 3)
     assert isinstance(maps, Maps)
     np.testing.assert_array_equal(maps.log_odds, drawn([few], at).log_odds)
+
+
+def jumping(odometry_lies: bool) -> tuple[FloatArray, FloatArray]:
+    """True poses in the known room; the path found if its first ten poses are 0.31 m off, or odometry once is."""
+    base = room()[2]
+    log, points, increments = drive()
+    true, increments = log.poses[:40], np.vstack([np.zeros(3), se2.between(log.poses[:39], log.poses[1:40])])
+    variances = np.array([motion.variance(i, PARAMETERS.motion) for i in increments])
+    path = true.copy()
+    if odometry_lies:
+        increments[10] += [0.31, 0.0, 0.0]
+    else:
+        path[:10] = se2.compose(np.array([0.2, -0.24, 0.0]), path[:10])
+    packed = refine._Packed(points[:40])
+    return true, refine._without_jumps(base, packed, path, increments, variances, PARAMETERS)
+
+
+def test_a_jump_in_a_known_map_is_taken_out() -> None:
+    true, path = jumping(odometry_lies=False)
+    assert np.abs(path - true)[:, :2].max() < 0.03
+
+
+def test_a_jump_of_odometry_is_not_taken_into_the_path() -> None:
+    true, path = jumping(odometry_lies=True)
+    np.testing.assert_array_equal(path, true)

@@ -133,6 +133,9 @@ class Slam:
         covariance[:2, :2] = root @ root.T
         return covariance
 
+    def entrance(self) -> tuple[FloatArray, FloatArray]:
+        return self.path()[0], self.covariance()
+
     def path(self) -> FloatArray:
         return np.column_stack([np.linspace(1.0, 4.0, 11), np.zeros((11, 2))])
 

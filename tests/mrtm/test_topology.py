@@ -88,15 +88,6 @@ def test_a_new_version_takes_the_place_of_the_old_one_which_becomes_history() ->
     assert topology.between(a.id, b.id) is newer[1]
 
 
-def test_a_refused_edge_is_remembered_with_its_reason_and_joins_nothing() -> None:
-    topology = Topology("red")
-    a, b = topology.new_vertex(), topology.new_vertex()
-    edge = topology.new_edge(EdgeKind.LOOP, a.id, b.id, UncertainPose(gtsam.Pose2(), np.eye(3)))
-    topology.refuse(edge, "does not fit")
-    assert [(f.edge, f.fate, f.reason) for f in topology.past] == [(edge, "refused", "does not fit")]
-    assert topology.between(a.id, b.id) is None
-
-
 def test_a_vertex_seen_from_itself_is_at_the_origin_without_doubt(rng: np.random.Generator) -> None:
     topology, _ = chain(rng, STEPS, 0.05)
     here = topology.along_shortest_paths(topology.vertices[2].id)[topology.vertices[2].id]
@@ -181,3 +172,29 @@ def test_the_path_goes_along_the_present_versions(rng: np.random.Generator) -> N
     now = topology.along_shortest_paths(a.id)[b.id]
     assert now.pose.equals(moved, 1e-12)
     np.testing.assert_allclose(now.covariance, 1e-4 * np.eye(3))
+
+
+def test_the_error_of_a_map_is_that_of_the_poses_it_was_made_from() -> None:
+    vertex = Vertex(VertexId("red", 0))
+    own = np.diag([1e-4, 4e-4, 1e-5])
+    pose = np.array([5.0, 0.0, np.pi / 2])
+    np.testing.assert_array_equal(vertex.uncertain(pose, own).covariance, own)
+    vertex.places = np.array([[0.0, 0.0, 0.0]])
+    vertex.covariances = np.diag([1e-4, 2e-4, 1e-4])[None]
+    found = vertex.uncertain(pose, own)
+    assert found.pose.equals(gtsam.Pose2(5.0, 0.0, np.pi / 2), 1e-12)
+    # Five metres on, turned left: what was to the side is ahead, and moves by 5 m times the error of the heading.
+    added = found.covariance - own
+    assert added[0, 0] == pytest.approx(2e-4 + 25.0 * 1e-4)
+    assert added[1, 1] == pytest.approx(1e-4)
+    assert added[2, 2] == pytest.approx(1e-4)
+    assert np.linalg.eigvalsh(added).min() > -1e-12
+    # Of two poses the nearer one counts more.
+    vertex.places = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
+    vertex.covariances = np.stack([np.diag([1e-4, 2e-4, 1e-4]), 1e-6 * np.eye(3)])
+    assert vertex.uncertain(pose, own).covariance[0, 0] - own[0, 0] < 0.3 * added[0, 0]
+    # A later visit draws into the map that is there, and does not make it worse.
+    before = vertex.places.copy()
+    vertex.drawn_from(np.array([[5.5, 0.5, 1.0], [12.0, 0.0, 0.0]]), np.stack([np.eye(3), 2.0 * np.eye(3)]))
+    np.testing.assert_array_equal(vertex.places, [*before, [12.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(vertex.covariances[-1], 2.0 * np.eye(3))

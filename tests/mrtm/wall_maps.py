@@ -23,6 +23,11 @@ class Made:
 
 
 def seen(walls: list[Wall], frame: FloatArray, low: float, high: float, seed: int, noise: float = 0.008) -> Surface:
+    """What ``made`` makes, prepared."""
+    return Surface.of(made(walls, frame, low, high, seed, noise))
+
+
+def made(walls: list[Wall], frame: FloatArray, low: float, high: float, seed: int, noise: float = 0.008) -> Made:
     """The map, with its origin at ``frame`` in the plan, of what lies between two x of the plan.
 
     Free space is to the left of each wall, and everything between the walls is known to be free.
@@ -52,7 +57,7 @@ def seen(walls: list[Wall], frame: FloatArray, low: float, high: float, seed: in
     for at, value in ((free, -4.0), (local, 4.0)):
         u, v = np.floor((at - origin) / RESOLUTION).astype(int).T
         log_odds[v, u] = value
-    return Surface.of(Made(Grid(log_odds, RESOLUTION, origin), local, normal_local))
+    return Made(Grid(log_odds, RESOLUTION, origin), local, normal_local)
 
 
 def unknown() -> Surface:
