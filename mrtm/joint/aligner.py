@@ -12,7 +12,7 @@ import numpy as np
 
 from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
 from mrtm.joint.alignment import Alignment, align
-from mrtm.joint.candidates import pairs
+from mrtm.joint.candidates import Candidate, pairs
 from mrtm.joint.graph import JointGraph
 from mrtm.joint.surface import Surface
 
@@ -31,6 +31,9 @@ KEPT = 8  # answers about two maps
 
 SCREENED = 2
 """Pairs whose overlap is worked out, for each that is tried at most."""
+
+AGAIN = 3
+"""Refused pairs of which is worked out whether their guess has become surer, when nothing else is due."""
 
 SURER = 4.0
 """Times the volume of the first guess's covariance over the new one's for a refused pair to be worth another look."""
@@ -104,6 +107,10 @@ class Aligner:
         group = {robot: number for number, robots in enumerate(groups) for robot in robots}
         self.attempts = {p: a for p, a in self.attempts.items() if group[p[0].robot] == group[p[1].robot]}
 
+    def joins(self, one: str, other: str) -> bool:
+        """Whether an alignment between maps of two robots is believed."""
+        return any(a.edge and {v.robot for v in pair} == {one, other} for pair, a in self.attempts.items())
+
     def look(self, graph: JointGraph, maps: Mapping[VertexId, Surface], most: int) -> bool:
         """Try the pairs of a component that are due, at most so many; whether any was.
 
@@ -128,6 +135,13 @@ class Aligner:
         for a, b in asked.keys() - {(c.a, c.b) for c in near}:
             self.attempts[a, b] = Attempt((closed[a], closed[b]), asked[a, b], None, None, "they hardly overlap")
         due = [c for c in near if self._due((c.a, c.b), (closed[c.a], closed[c.b]), c.guess)][:most]
+        for pair in [p for p, a in self.attempts.items() if not a.edge and {*p} <= closed.keys()][
+            : 0 if due else AGAIN
+        ]:
+            self.attempts[pair] = self.attempts.pop(pair)  # the next time it is another's turn
+            guess = relative(*pair)
+            if self._due(pair, (closed[pair[0]], closed[pair[1]]), guess):
+                due.append(Candidate(*pair, guess))
         for a, b, guess in due:
             self._try((a, b), (closed[a], closed[b]), guess)
         return bool(due)

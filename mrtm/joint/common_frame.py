@@ -91,7 +91,7 @@ def solve(maps: Sequence[OwnMap], sightings: Measurements, believed: BoolArray, 
     m = len(start)
     covariance = np.zeros((m, m, 3, 3))
     wanted = _asked_about(maps, sightings)
-    covariance[1:, 1:] = selected_inverse(matrix[3:, 3:], wanted - 1)
+    covariance[1:, 1:] = selected_inverse(matrix[3:, 3:], (wanted[0] - 1, wanted[1] - 1))
     if not np.all(np.diagonal(covariance.diagonal(), axis1=0, axis2=1) >= 0.0):  # NaN as well
         raise np.linalg.LinAlgError("the sightings do not fix the frames")
     return CommonFrame(poses, covariance)

@@ -82,6 +82,9 @@ class Hypothesis:
 class RobotGraph(Protocol):
     """One robot's own graph; :class:`mrtm.joint.graph.JointGraph` is one."""
 
+    def __hash__(self) -> int:
+        """By identity."""
+
     @property
     def root(self) -> VertexId:
         """The vertex that fixes the robot's own frame."""

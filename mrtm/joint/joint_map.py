@@ -73,9 +73,14 @@ class JointMap:
         changed = {robot for robot in robots if robot not in self._own}
         for edge in edges:
             known = self._edges.setdefault(edge.id.robot, {})
-            if edge.id not in known or edge.version > known[edge.id].version:
-                known[edge.id] = edge
-                changed.add(edge.id.robot)
+            before = known.get(edge.id)
+            if before is not None and edge.version <= before.version:
+                continue
+            if before is not None and (edge.tail, edge.head) != (before.tail, before.head):
+                self.refused[edge.id] = refusal(edge, f"its ends were {before.tail} and {before.head}")
+                continue
+            known[edge.id] = edge
+            changed.add(edge.id.robot)
         for robot in sorted(changed):
             self._enter(robot)
 
@@ -84,7 +89,7 @@ class JointMap:
         edges = tuple(edge for _, edge in sorted(self._edges.get(robot, {}).items()))
         before = self._own.get(robot)
         self._own[robot], refused = own_graph(robot, edges)
-        self.refused = {i: why for i, why in self.refused.items() if i not in self._edges.get(robot, {})} | refused
+        self.refused = {i: why for i, why in self.refused.items() if i.robot != robot} | refused
         if before is None or self._component[robot].graph is before:
             self._apart([robot])
             return

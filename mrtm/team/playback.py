@@ -82,6 +82,8 @@ class Playback:
             report(number / len(meetings))
         for _, record in told:
             self._write_down(record)
+        for teammate in self.team.values():
+            teammate.learn()
         self.listener.settle()
 
     def agree(self) -> bool:
@@ -112,7 +114,9 @@ class Playback:
         with self._stages("exchange"):
             traffic = exchange(one.store, other.store)
         for teammate in (one, other):
-            teammate.think()
+            if teammate.is_due():
+                teammate.think()
+                teammate.align()
             for robot in teammate.joint.robots.keys() & {teammate.name}:  # none if it has not taken a scan yet
                 self._frames.append((time, frozenset(teammate.joint.component(robot).robots)))
         verdict, reason = _verdict(one, robots)

@@ -41,7 +41,7 @@ class Peers:
         self.alignments = Alignments()
 
 
-GROWN = 1.1
+GROWN = 1.1  # times as much is known
 
 ROUNDS = 10  # of alignments until the estimate has come to rest, at most
 
@@ -81,7 +81,8 @@ class Teammate:
         self._evidence = Evidence(self._maps, self.joint, peers.answers)
         self._fusing: dict[EdgeId, Edge | SightingEdge] = {}
         self._told: dict[Key, int] = {}  # version of each record that the joint map knows
-        self._judged = 0, 0  # how many records, and sightings, were known when these were last judged
+        self._held = b""  # the hash of what was known when sightings were last judged
+        self._thought = 0, 0  # how many records, and sightings, were known at the last ``think``
 
     def judgements_between(self, robots: tuple[str, str]) -> dict[HypothesisId, Judgement]:
         """The judgements of sightings between two robots."""
@@ -89,21 +90,29 @@ class Teammate:
         ids = [(r.observer, r.number) for r in between]
         return {key: self.judgements[key] for key in ids if key in self.judgements}
 
-    def think(self) -> None:
-        """Bring the joint map up to date with the records.
+    def is_due(self) -> bool:
+        """Whether there are GROWN times as many records or sightings to go by as at the last ``think``.
 
-        Sightings are judged again, and maps aligned, when there are GROWN times as many records or sightings to go by:
-        so all the judging of a growing store takes a fixed number of times as long as the last.
+        Who thinks only then spends on all the thinking about a growing store a fixed number of times the last.
         """
+        return any(now >= GROWN * max(before, 1) for now, before in zip(self._size(), self._thought, strict=True))
+
+    def learn(self) -> None:
+        """Bring the robots' own maps up to date with the records."""
         robots = {record.id.robot for record in self._news(VertexRecord)}
         edges = [record.edge for record in self._news(EdgeRecord)]
         with self._stages("joint map"):
             self.joint.learn(edges, robots)
-        held = len(self.store), self.store.count(SightingRecord)
-        if any(now >= GROWN * before for now, before in zip(held, self._judged, strict=True) if now):
-            self._judged = held
+
+    def think(self) -> None:
+        """Bring the joint map up to date with the records."""
+        self._thought = self._size()
+        self.learn()
+        if self.store.summary() != self._held:
             self._fuse()
-            self.align()
+
+    def _size(self) -> tuple[int, int]:
+        return len(self.store), self.store.count(SightingRecord)
 
     def settle(self) -> None:
         """``think`` and ``align`` anew, from the records alone; with this the robot is at its end.
@@ -114,7 +123,7 @@ class Teammate:
         if held not in self._peers.settled:
             fresh = Teammate(None, self._config, self._stages, Peers(), self.store)
             fresh.think()
-            fresh.align(ROUNDS - 1)
+            fresh.align(ROUNDS)
             with self._stages("joint map"):
                 for component in fresh.joint.components():
                     component.graph.optimize_fully()
@@ -156,6 +165,7 @@ class Teammate:
                 while len(concluded) > KEPT:
                     del concluded[next(iter(concluded))]
             self.judgements, edges = concluded[held]
+            self._held = held
         self._fusing = {edge.id: self._versioned(edge) for edge in edges}
         self._enter()
 
