@@ -89,7 +89,7 @@ class JointMap:
         edges = tuple(edge for _, edge in sorted(self._edges.get(robot, {}).items()))
         before = self._own.get(robot)
         self._own[robot], refused = own_graph(robot, edges)
-        self.refused = {i: why for i, why in self.refused.items() if i.robot != robot} | refused
+        self.refused |= refused
         if before is None or self._component[robot].graph is before:
             self._apart([robot])
             return
