@@ -122,7 +122,9 @@ class JointMap:
                 except GraphError:
                     pass  # perhaps on the way there only
             try:
-                component = Component(robots, self._graph_of(robots, mine), mine)
+                component = self._grown(component, robots, mine) or Component(
+                    robots, self._graph_of(robots, mine), mine
+                )
             except GraphError as error:
                 self._refuse(next(iter(mine.values())), error)
                 self._apart(robots)
@@ -147,6 +149,19 @@ class JointMap:
                 group.update(dict.fromkeys(b, a))
         return sorted({tuple(sorted(members)) for members in group.values()})
 
+    def _grown(self, component: Component, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> Component | None:
+        """The component with the robots that come to those it has; None if it has to be made anew."""
+        inside = set(component.robots)
+        within = {i: e for i, e in added.items() if _ends(e) <= inside}
+        if len(inside) < 2 or not inside < set(robots) or component.robots not in self.connected(within.values()):
+            return None
+        try:
+            _exchange(component, within)
+            self._merge(component.graph, inside, robots, added)
+        except GraphError:
+            return None
+        return Component(robots, component.graph, added)
+
     def _graph_of(self, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> JointGraph:
         """The robots' own graphs made one: the first one's, then the others in the order in which they are reached."""
         root = robots[0]
@@ -154,15 +169,20 @@ class JointMap:
             return self._own[root]
         graph = JointGraph(VertexId(root, 0))
         graph.update(add=self._own[root].edges())
-        reached = {root}
-        graph.update(add=[e for e in added.values() if _ends(e) == reached])
+        graph.update(add=[e for e in added.values() if _ends(e) == {root}])
+        self._merge(graph, {root}, robots, added)
+        return graph
+
+    def _merge(
+        self, graph: JointGraph, reached: set[str], robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]
+    ) -> None:
+        """Take the other robots' own graphs into that of those ``reached``, whose added edges it has."""
         while len(reached) < len(robots):
             bridge = next(e for e in added.values() if e.estimate and _ends(e) & reached and _ends(e) - reached)
             both = reached | _ends(bridge)
             more = [e for e in added.values() if e is not bridge and _ends(e) <= both and not _ends(e) <= reached]
             graph.merge(self._own[(both - reached).pop()], bridge, more)
             reached = both
-        return graph
 
 
 def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
