@@ -1,6 +1,9 @@
 """Iterative closest points between the surfaces of two local maps, by Open3D."""
 
 import ctypes
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -18,6 +21,24 @@ ITERATIONS = 15  # a round
 LEAST = 30  # pairs of points below which there is nothing to align
 
 
+@contextmanager
+def _one_cpu() -> Iterator[None]:
+    """What counts the processors within, as Open3D's TBB does when it first works, finds one (on Linux).
+
+    Threads add up in any order, and along a corridor, where nothing but the last digits says where to stop, that moved
+    the result by up to a metre from run to run. For so few points one thread is also the fastest.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
 @cache
 def _open3d() -> Any:
     """Open3D, loaded late: it takes half a second. Its wheel needs libusb (for cameras), which another wheel brings."""
@@ -25,7 +46,11 @@ def _open3d() -> Any:
         import libusb_package
 
         ctypes.CDLL(str(libusb_package.get_library_path()), ctypes.RTLD_GLOBAL)
-        import open3d
+        with _one_cpu():
+            import open3d
+
+            one = _cloud(open3d, np.zeros((1, 2)), np.array([[1.0, 0.0]]))
+            open3d.pipelines.registration.registration_icp(one, one, 1.0)  # only now its threads are counted
     except (ImportError, OSError) as error:
         raise MrtmError(f"Open3D cannot be loaded ({error}); on a bare Linux: apt install libgl1 libx11-6") from error
     return open3d
@@ -65,7 +90,7 @@ def icp(a: Surface, b: Surface, guess: FloatArray) -> FloatArray | None:
             registration.ICPConvergenceCriteria(1e-7, 1e-7, ITERATIONS),
         )
         t = result.transformation
-        # Open3D's threads sum up in any order: the last digits differ from run to run, and must not come through.
+        # Where Open3D's threads are several they sum up in any order: the last digits must not come through.
         pose = np.round([t[0, 3], t[1, 3], np.arctan2(t[1, 0], t[0, 0])], 6)
         # Where nothing fixes a direction its equations are near singular and a step can go anywhere.
         if not np.isfinite(pose).all() or np.hypot(*(pose[:2] - guess[:2])) > 2.0 * ROUNDS[0][0]:

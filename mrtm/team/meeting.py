@@ -73,7 +73,11 @@ def fusing_edges(believed: Iterable[AnchoredSighting]) -> list[Edge | SightingEd
 def _between(tail: VertexId, head: VertexId, sightings: tuple[AnchoredSighting, ...]) -> list[Edge | SightingEdge]:
     name = f"{tail}-{head}"
     edge = fusing_edge(EdgeId(name, 0), 0, sightings)
-    return [edge] if edge else [SightingEdge(EdgeId(name, n), 0, s) for n, s in enumerate(sightings, 1)]
+    if edge is not None:
+        return [edge]
+    # One with a heading that yet fixes no pose comes from where a robot hardly knew its own: it adds nothing.
+    alone = [(n, s) for n, s in enumerate(sightings, 1) if s.sighting.heading is None]
+    return [SightingEdge(EdgeId(name, n), 0, s) for n, s in alone]
 
 
 def bridges(offsets: Mapping[tuple[str, str], UncertainPose], edges: Iterable[GraphEdge]) -> list[Edge]:
