@@ -12,7 +12,7 @@ import numpy as np
 
 from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
 from mrtm.joint.alignment import Alignment, align
-from mrtm.joint.candidates import pairs
+from mrtm.joint.candidates import Candidate, pairs
 from mrtm.joint.graph import JointGraph
 from mrtm.joint.surface import Surface
 
@@ -23,6 +23,17 @@ MOVED = 4.0
 
 CONTRADICTED = 30.0
 """chi2 of 3 degrees of freedom, as for loops: an alignment so far from the joint estimate is taken back."""
+
+NEAR = 0.25
+"""Squared Mahalanobis distance between two guesses up to which they are one question."""
+
+KEPT = 8  # answers about two maps
+
+SCREENED = 2
+"""Pairs whose overlap is worked out, for each that is tried at most."""
+
+AGAIN = 3
+"""Refused pairs of which is worked out whether their guess has become surer, when nothing else is due."""
 
 SURER = 4.0
 """Times the volume of the first guess's covariance over the new one's for a refused pair to be worth another look."""
@@ -47,10 +58,40 @@ class Attempt:
     refusal: str
 
 
-class Aligner:
-    """The alignments of one joint map."""
+class Alignments:
+    """What came of aligning maps, for several aligners that ask about the same ones."""
 
     def __init__(self) -> None:
+        self._found: dict[tuple[Surface, Surface], list[tuple[UncertainPose, Alignment | None]]] = {}
+
+    def __call__(self, a: Surface, b: Surface, guess: UncertainPose) -> Alignment | None:
+        """See ``align``; the answer to next to the same question is the same."""
+        before = self._found.setdefault((a, b), [])
+        for asked, found in before:
+            if _same_question(asked, guess):
+                return found
+        found = align(a, b, guess)
+        before.append((guess, found))
+        del before[:-KEPT]
+        return found
+
+
+def _same_question(one: UncertainPose, other: UncertainPose) -> bool:
+    offset = gtsam.Pose2.Logmap(one.pose.between(other.pose))
+    near = float(offset @ np.linalg.solve(one.covariance, offset)) < NEAR
+    volumes = np.linalg.det(one.covariance) / np.linalg.det(other.covariance)
+    return near and 1.0 / SURER < volumes < SURER
+
+
+class Aligner:
+    """The alignments of one joint map.
+
+    Args:
+        alignments: shared with others; own ones by default.
+    """
+
+    def __init__(self, alignments: Alignments | None = None) -> None:
+        self._align = Alignments() if alignments is None else alignments
         self.attempts: dict[Pair, Attempt] = {}
         self._versions: dict[Pair, int] = {}
 
@@ -81,10 +122,26 @@ class Aligner:
         closed = {v: maps[v] for v in poses if v in maps}
 
         def wanted(a: VertexId, b: VertexId) -> bool:
-            return not self._aligned((a, b), (closed[a], closed[b]))
+            return self._open((a, b), (closed[a], closed[b]), poses[a].between(poses[b]))
 
-        near = pairs(closed, poses, graph.relative, wanted, most=len(poses) ** 2)
+        looks = SCREENED * most
+        asked: dict[Pair, UncertainPose] = {}
+
+        def relative(a: VertexId, b: VertexId) -> UncertainPose:
+            guess = asked[a, b] = graph.relative(a, b)
+            return guess
+
+        near = pairs(closed, poses, relative, wanted, most=looks, looks=looks)
+        for a, b in asked.keys() - {(c.a, c.b) for c in near}:
+            self.attempts[a, b] = Attempt((closed[a], closed[b]), asked[a, b], None, None, "they hardly overlap")
         due = [c for c in near if self._due((c.a, c.b), (closed[c.a], closed[c.b]), c.guess)][:most]
+        for pair in [p for p, a in self.attempts.items() if not a.edge and {*p} <= closed.keys()][
+            : 0 if due else AGAIN
+        ]:
+            self.attempts[pair] = self.attempts.pop(pair)  # the next time it is another's turn
+            guess = relative(*pair)
+            if self._due(pair, (closed[pair[0]], closed[pair[1]]), guess):
+                due.append(Candidate(*pair, guess))
         for a, b, guess in due:
             self._try((a, b), (closed[a], closed[b]), guess)
         return bool(due)
@@ -103,22 +160,24 @@ class Aligner:
                 gone.append(attempt.edge.id)
         return gone
 
-    def _aligned(self, pair: Pair, maps: tuple[Surface, Surface]) -> bool:
-        """Whether the pair, as its maps are now, has an alignment that is believed."""
+    def _open(self, pair: Pair, maps: tuple[Surface, Surface], a_T_b: gtsam.Pose2) -> bool:
+        """Whether the pair, as its maps are now, is new, or has moved since it was refused."""
         old = self.attempts.get(pair)
-        return old is not None and old.edge is not None and _unchanged(old, maps)
+        if old is None or not _unchanged(old, maps):
+            return True
+        return old.edge is None and _moved(old, a_T_b) > MOVED
 
     def _due(self, pair: Pair, maps: tuple[Surface, Surface], guess: UncertainPose) -> bool:
         """Whether a pair without an alignment is worth a try, the first or another."""
         old = self.attempts.get(pair)
         if old is None or not _unchanged(old, maps):
             return True
-        offset = gtsam.Pose2.Logmap(old.guess.pose.between(guess.pose))
-        moved = float(offset @ np.linalg.solve(old.guess.covariance, offset))
-        return moved > MOVED or np.linalg.det(old.guess.covariance) > SURER**2 * np.linalg.det(guess.covariance)
+        return _moved(old, guess.pose) > MOVED or np.linalg.det(old.guess.covariance) > SURER**2 * np.linalg.det(
+            guess.covariance
+        )
 
     def _try(self, pair: Pair, maps: tuple[Surface, Surface], guess: UncertainPose) -> None:
-        found = align(*maps, guess)
+        found = self._align(*maps, guess)
         edge, refusal = None, "nothing of the maps can meet"
         if found is not None:
             refusal = found.refusal or ""
@@ -128,6 +187,12 @@ class Aligner:
                 pose, covariance = found.estimate
                 edge = Edge(name, version, EdgeKind.ALIGNMENT, *pair, pose, covariance)
         self.attempts[pair] = Attempt(maps, guess, found, edge, refusal)
+
+
+def _moved(attempt: Attempt, a_T_b: gtsam.Pose2) -> float:
+    """Squared Mahalanobis distance, as the guess saw it."""
+    offset = gtsam.Pose2.Logmap(attempt.guess.pose.between(a_T_b))
+    return float(offset @ np.linalg.solve(attempt.guess.covariance, offset))
 
 
 def _unchanged(attempt: Attempt, maps: tuple[Surface, Surface]) -> bool:

@@ -1,6 +1,7 @@
 """Which closed maps are worth aligning after an event: those that are likely to overlap, not all pairs of all."""
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import NamedTuple
 
 import gtsam
@@ -32,6 +33,7 @@ def pairs(
     relative: Callable[[VertexId, VertexId], UncertainPose],
     wanted: Callable[[VertexId, VertexId], bool] = lambda a, b: True,
     most: int = MOST,
+    looks: int | None = None,
 ) -> list[Candidate]:
     """The pairs of maps to align, the largest overlap first.
 
@@ -41,31 +43,45 @@ def pairs(
         relative: a_T_b and its covariance in the frame of b, such as ``JointGraph.relative``; asked of near pairs only.
         wanted: whether a pair, a before b, is worth a look at all. All by default.
         most: pairs at most.
+        looks: pairs that are asked about, those of the nearest maps; all by default.
     """
-    circles = {vertex: _circle(surface, poses[vertex]) for vertex, surface in maps.items() if len(surface.points)}
+    vertices = sorted(vertex for vertex, surface in maps.items() if len(surface.points))
+    if not vertices:
+        return []
+    circles = np.array([_circle(maps[vertex], poses[vertex]) for vertex in vertices])
+    apart = np.hypot(*(circles[:, None, :2] - circles[None, :, :2]).transpose(2, 0, 1))
+    apart -= circles[:, None, 2] + circles[None, :, 2]
+    i, k = np.nonzero(np.triu(apart <= MAX_XY, 1))
     found: list[tuple[float, Candidate]] = []
-    for a in sorted(circles):
-        for b in sorted(circles):
-            if a >= b or not wanted(a, b):
-                continue
-            apart = np.hypot(*(circles[a][:2] - circles[b][:2])) - circles[a][2] - circles[b][2]
-            if apart > MAX_XY:
-                continue
-            guess = relative(a, b)
-            if apart > 3.0 * np.sqrt(np.linalg.eigvalsh(guess.covariance[:2, :2])[1]):
-                continue
-            area = _likely_overlap(maps[a], maps[b], guess)
-            if area >= LEAST_OVERLAP:
-                found.append((area, Candidate(a, b, guess)))
+    left = len(i) if looks is None else looks
+    for place in np.argsort(apart[i, k], kind="stable").tolist():
+        a, b, distance = vertices[i[place]], vertices[k[place]], apart[i[place], k[place]]
+        if not wanted(a, b):
+            continue
+        if left == 0:
+            break
+        left -= 1
+        guess = relative(a, b)
+        if distance > 3.0 * np.sqrt(np.linalg.eigvalsh(guess.covariance[:2, :2])[1]):
+            continue
+        area = _likely_overlap(maps[a], maps[b], guess)
+        if area >= LEAST_OVERLAP:
+            found.append((area, Candidate(a, b, guess)))
     found.sort(key=lambda item: (-item[0], item[1].a, item[1].b))
     return [candidate for _, candidate in found[:most]]
 
 
 def _circle(surface: Surface, pose: gtsam.Pose2) -> FloatArray:
     """Around what a map knows: x, y, radius in the joint frame."""
+    x, y, radius = _extent(surface)
+    return np.array([*pose.transformFrom(np.array([x, y])), radius])
+
+
+@lru_cache(2**12)
+def _extent(surface: Surface) -> tuple[float, float, float]:
     low, high = surface.points.min(axis=0), surface.points.max(axis=0)
-    centre = np.append(0.5 * (low + high), 0.0)
-    return np.append(se2.compose(array_of(pose), centre)[:2], 0.5 * np.hypot(*(high - low)))
+    x, y = 0.5 * (low + high)
+    return x, y, 0.5 * float(np.hypot(*(high - low)))
 
 
 def _likely_overlap(a: Surface, b: Surface, guess: UncertainPose) -> float:

@@ -3,8 +3,8 @@
 The robots' vertices are the variables, each robot's own map enters as the tree of ``OwnMap``, a sighting as one
 measurement between two vertices. It serves to judge sightings; the joint map itself is iSAM2's.
 
-Solved by SuperLU one right side at a time, inverted by LAPACK's LU: Cholesky and triangular solves of OpenBLAS start
-threads even for small matrices, which on a busy machine costs a thousand times the work.
+Solved by SuperLU one right side at a time: Cholesky and triangular solves of OpenBLAS start threads even for small
+matrices, which on a busy machine costs a thousand times the work.
 """
 
 from collections.abc import Sequence
@@ -17,6 +17,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from frontend import se2
 from mrtm.joint.hypotheses import BoolArray, FloatArray, IntArray, Measurements, OwnMap
 from mrtm.joint.innovation import innovations
+from mrtm.joint.selected_inverse import selected_inverse
 
 _STEPS, _SETTLED = 10, 1e-4
 
@@ -27,7 +28,8 @@ class CommonFrame:
 
     Attributes:
         poses: (m, 3) one row a vertex.
-        covariance: (m, m, 3, 3) of all poses together, each in its own frame.
+        covariance: (m, m, 3, 3) of all poses together, each in its own frame; of pairs of vertices only those that the
+            sightings given to ``solve``, whether believed or not, join, and the roots of the robots these join.
     """
 
     poses: FloatArray
@@ -86,13 +88,22 @@ def solve(maps: Sequence[OwnMap], sightings: Measurements, believed: BoolArray, 
         poses = se2.compose(poses, exp(step))
         if np.abs(step).max() < _SETTLED:
             break
-    covariance = np.zeros(matrix.shape)
-    covariance[3:, 3:] = np.linalg.inv(matrix[3:, 3:].toarray())
-    covariance = 0.5 * (covariance + covariance.T)
-    if not np.all(np.diag(covariance) >= 0.0):  # NaN as well
-        raise np.linalg.LinAlgError("the sightings do not fix the frames")
     m = len(start)
-    return CommonFrame(poses, covariance.reshape(m, 3, m, 3).transpose(0, 2, 1, 3))
+    covariance = np.zeros((m, m, 3, 3))
+    wanted = _asked_about(maps, sightings)
+    covariance[1:, 1:] = selected_inverse(matrix[3:, 3:], (wanted[0] - 1, wanted[1] - 1))
+    if not np.all(np.diagonal(covariance.diagonal(), axis1=0, axis2=1) >= 0.0):  # NaN as well
+        raise np.linalg.LinAlgError("the sightings do not fix the frames")
+    return CommonFrame(poses, covariance)
+
+
+def _asked_about(maps: Sequence[OwnMap], sightings: Measurements) -> IntArray:
+    """(2, k) rows of vertices between which something will be predicted: of sightings, and their robots' roots."""
+    sizes = [len(own.vertices) for own in maps]
+    roots = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes)
+    ends = np.stack([sightings.tail, sightings.head])
+    both = np.unique(np.concatenate([ends, roots[ends]], axis=1), axis=1)
+    return both[:, (both > 0).all(axis=0)]  # the first is fixed: nothing of it varies
 
 
 def examine(frame: CommonFrame, sightings: Measurements, believed: BoolArray) -> Examination:

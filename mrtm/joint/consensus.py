@@ -20,7 +20,7 @@ _PARTNERS = 6  # sightings without heading each is paired with, those that fix t
 _BASELINE = 4.0  # sigmas by which two sighted points must be apart to fix a heading
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
     """Sightings of one pair of robots that agree with each other, and where they put the second robot.
 

@@ -17,6 +17,7 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 
 import numpy as np
 
@@ -87,7 +88,7 @@ def judge(
 
     Args:
         hypotheses: in any order, no id twice.
-        graphs: each robot's own, by name; a sighting of a robot without one waits.
+        graphs: each robot's own, by name; a sighting of a robot without one waits. One that changes is another graph.
         evidence: what local maps say of an offset; without it only sightings count.
 
     Raises:
@@ -112,7 +113,12 @@ def _own_maps(hypotheses: Sequence[Hypothesis], graphs: Mapping[str, RobotGraph]
     for h in hypotheses:
         wanted[h.observer.robot].add(h.observer)
         wanted[h.observed.robot].add(h.observed)
-    return {robot: OwnMap.of(graphs[robot], vertices) for robot, vertices in wanted.items()}
+    return {robot: _own_map(graphs[robot], frozenset(vertices)) for robot, vertices in wanted.items()}
+
+
+@lru_cache(512)
+def _own_map(graph: RobotGraph, wanted: frozenset[VertexId]) -> OwnMap:
+    return OwnMap.of(graph, wanted)
 
 
 def _explain(

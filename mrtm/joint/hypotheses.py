@@ -6,8 +6,10 @@ noise is counted with every sighting as if it were its own: they are far more ce
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple, Protocol
+from weakref import WeakValueDictionary
 
 import gtsam
 import numpy as np
@@ -34,10 +36,13 @@ class Slack(NamedTuple):
     theta: float
 
 
+KEPT = 2**16  # sightings made ready to be judged
+
+_DIGITS = 9  # of metres and radians
 _HAIR = 1e-10  # of a variance
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
     """A sighting that may be true.
 
@@ -47,6 +52,7 @@ class Hypothesis:
         sighting: what was measured.
         tail_T_observer: the observer's pose in its vertex, covariance in the frame of the robot.
         head_T_observed: the observed robot's pose in its vertex, likewise.
+        anchors: x, y, theta of these two.
 
     Raises:
         ValueError: if both vertices are of one robot.
@@ -58,10 +64,13 @@ class Hypothesis:
     sighting: Sighting
     tail_T_observer: UncertainPose
     head_T_observed: UncertainPose
+    anchors: tuple[list[float], list[float]] = field(init=False)
 
     def __post_init__(self) -> None:
         if self.observer.robot == self.observed.robot:
             raise ValueError(f"sighting {self.id}: robot {self.observer.robot} cannot sight itself")
+        anchors = coordinates(self.tail_T_observer.pose), coordinates(self.head_T_observed.pose)
+        object.__setattr__(self, "anchors", anchors)
 
     @property
     def robots(self) -> tuple[str, str]:
@@ -72,6 +81,9 @@ class Hypothesis:
 
 class RobotGraph(Protocol):
     """One robot's own graph; :class:`mrtm.joint.graph.JointGraph` is one."""
+
+    def __hash__(self) -> int:
+        """By identity."""
 
     @property
     def root(self) -> VertexId:
@@ -84,7 +96,7 @@ class RobotGraph(Protocol):
         """a_T_b with its covariance in the frame of b."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class OwnMap:
     """What one robot's graph knows of the m vertices that matter.
 
@@ -120,6 +132,29 @@ class OwnMap:
                 relative[k, i], covariances[k, i] = coordinates(back.pose), back.covariance
         return cls(vertices, poses, relative, covariances, _tree(covariances))
 
+    def among(self, wanted: Iterable[VertexId]) -> "OwnMap":
+        """The root and the ``wanted`` vertices only; one and the same object as long as these stay where they are.
+
+        Its numbers are rounded, far below what matters, so that it does not change with every digit of the others.
+        """
+        return _among(self, frozenset(wanted))
+
+
+_interned: WeakValueDictionary[tuple[tuple[VertexId, ...], bytes], OwnMap] = WeakValueDictionary()
+
+
+@lru_cache(2**12)
+def _among(own: OwnMap, wanted: frozenset[VertexId]) -> OwnMap:
+    rows = [row for row, vertex in enumerate(own.vertices) if row == 0 or vertex in wanted]
+    vertices, block = tuple(own.vertices[row] for row in rows), np.ix_(rows, rows)
+    poses, relative = own.poses[rows].round(_DIGITS), own.relative[block].round(_DIGITS)
+    covariances = own.covariances[block].round(2 * _DIGITS)
+    name = vertices, b"".join(part.tobytes() for part in (poses, relative, covariances))
+    found = _interned.get(name)
+    if found is None:
+        found = _interned[name] = OwnMap(vertices, poses, relative, covariances, _tree(covariances))
+    return found
+
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
@@ -145,21 +180,10 @@ class Measurements:
     @classmethod
     def of(cls, hypotheses: Sequence[Hypothesis], rows: dict[VertexId, int], slack: Slack) -> "Measurements":
         """Turn hypotheses into arrays; ``rows`` is the table of vertices, ``slack`` is added to both robots' poses."""
-        more = np.diag([slack.xy, slack.xy, slack.theta]) ** 2
         n = len(hypotheses)
-        measured, noise = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
-        for j, hypothesis in enumerate(hypotheses):
-            observer, observed = (
-                UncertainPose(end.pose, end.covariance + more)
-                for end in (hypothesis.tail_T_observer, hypothesis.head_T_observed)
-            )
-            pose = hypothesis.sighting.relative_pose()
-            if pose is None:
-                measured[j, :2] = hypothesis.sighting.position
-                noise[j, :2, :2] = _position_noise(hypothesis.sighting, observer.covariance, observed.covariance)
-            else:
-                between = compose(compose(observer, pose), inverse(observed))
-                measured[j], noise[j] = coordinates(between.pose), between.covariance
+        values = [_measured(hypothesis, slack) for hypothesis in hypotheses]
+        measured = np.array([pose for pose, _ in values]).reshape(n, 3)
+        noise = np.array([covariance for _, covariance in values]).reshape(n, 3, 3)
         # A hair wider: seen from far off it is so long and thin that rounding would make it indefinite.
         noise += _HAIR * np.trace(noise, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         return cls(
@@ -168,8 +192,8 @@ class Measurements:
             np.array([h.sighting.heading is not None for h in hypotheses], np.bool_),
             measured,
             noise,
-            np.array([coordinates(h.tail_T_observer.pose) for h in hypotheses]).reshape(n, 3),
-            np.array([coordinates(h.head_T_observed.pose) for h in hypotheses]).reshape(n, 3),
+            np.array([h.anchors[0] for h in hypotheses]).reshape(n, 3),
+            np.array([h.anchors[1] for h in hypotheses]).reshape(n, 3),
         )
 
     def rows(self, which: IntArray, vertices: IntArray) -> "Measurements":
@@ -186,6 +210,23 @@ class Measurements:
 
     def __len__(self) -> int:
         return len(self.tail)
+
+
+@lru_cache(KEPT)
+def _measured(hypothesis: Hypothesis, slack: Slack) -> tuple[list[float], FloatArray]:
+    """A row of ``measured`` and ``noise``."""
+    more = np.diag([slack.xy, slack.xy, slack.theta]) ** 2
+    observer, observed = (
+        UncertainPose(end.pose, end.covariance + more)
+        for end in (hypothesis.tail_T_observer, hypothesis.head_T_observed)
+    )
+    pose = hypothesis.sighting.relative_pose()
+    if pose is None:
+        noise = np.eye(3)
+        noise[:2, :2] = _position_noise(hypothesis.sighting, observer.covariance, observed.covariance)
+        return [*hypothesis.sighting.position.tolist(), 0.0], noise
+    between = compose(compose(observer, pose), inverse(observed))
+    return coordinates(between.pose), between.covariance
 
 
 def coordinates(pose: gtsam.Pose2) -> list[float]:

@@ -1,5 +1,6 @@
 """From pairs of robots whose frames are known to each other to components, and which sightings fit them."""
 
+import heapq
 import math
 from collections.abc import Mapping, Sequence
 
@@ -11,7 +12,7 @@ from frontend import se2
 from mrtm.joint.common_frame import CommonFrame, examine, solve
 from mrtm.joint.hypotheses import BoolArray, FloatArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
 from mrtm.joint.innovation import gates
-from mrtm.joint.pairs import LEAST_SUPPORT, Evidence, Finding, find, outnumbers
+from mrtm.joint.pairs import LEAST_SUPPORT, Evidence, Finding, Proposed, find, outnumbers
 
 Pair = tuple[str, str]
 
@@ -62,11 +63,19 @@ class Joining:
             members.setdefault(h.robots, []).append(row)
         self.rows = {pair: np.array(members[pair], np.int64) for pair in sorted(members)}
         self.findings: dict[Pair, Finding] = {}
+        proposed: dict[Pair, Proposed] = {}
         for pair, rows in self.rows.items():
-            sightings = self._among(pair, rows)
-            self.findings[pair] = find(self._maps[pair[0]], self._maps[pair[1]], sightings, evidence)
+            proposed[pair] = self._proposed(pair, rows, slack)
+            self.findings[pair] = find(proposed[pair], None)
         self.contradicting: dict[Pair, bool] = {}
-        self._settle(self._span())
+        self._settle(self._span(proposed, evidence))
+
+    def _proposed(self, pair: Pair, rows: IntArray, slack: Slack) -> Proposed:
+        """What the sightings of a pair propose, seen by the vertices that these have to do with."""
+        hypotheses = tuple(self._hypotheses[row] for row in rows.tolist())
+        ends = [vertex for h in hypotheses for vertex in (h.observer, h.observed)]
+        a, b = (self._maps[robot].among(v for v in ends if v.robot == robot) for robot in pair)
+        return Proposed.of(a, b, hypotheses, slack)
 
     def within(self, slack: Slack) -> BoolArray:
         """(n,) which sightings would fit where they are believed not to, if the poses were uncertain by ``slack``."""
@@ -120,28 +129,43 @@ class Joining:
     def _vertices(self, robots: Sequence[str]) -> IntArray:
         return np.concatenate([self._at[robot] for robot in robots])
 
-    def _span(self) -> list[Pair]:
-        """Believe the strongest pairs as far as they make trees, and place their robots; the pairs left over."""
-        joined = {pair: finding.joined for pair, finding in self.findings.items() if finding.joined is not None}
+    def _span(self, proposed: Mapping[Pair, Proposed], evidence: Evidence | None) -> list[Pair]:
+        """Believe the strongest pairs as far as they make trees, and place their robots; the pairs left over.
+
+        The local maps, which take long to answer, are asked about the pairs that would make the tree, and no other.
+        """
+        at = {robot: np.zeros(3) for robot in self._maps}
+        groups = _groups(self._maps, [])
+        closing: list[Pair] = []
 
         def weakness(pair: Pair) -> tuple[bool, int, Pair]:
             finding = self.findings[pair]
-            return finding.lifted, finding.rival - joined[pair].support, pair
+            best = finding.joined or next(iter(finding.sets), None)
+            return finding.joined is None, finding.rival - (best.support if best else 0), pair
 
-        at = {robot: np.zeros(3) for robot in self._maps}
-        tree: list[Pair] = []
-        closing: list[Pair] = []
-        for a, b in sorted(joined, key=weakness):
-            groups = _groups(self._maps, tree)
+        queue = [(weakness(pair), evidence is None) for pair in self.findings]
+        heapq.heapify(queue)
+        while queue:
+            (*_, (a, b)), asked = heapq.heappop(queue)
+            finding = self.findings[a, b]
             if groups[a] is groups[b]:
-                closing.append((a, b))
+                if finding.joined is not None:
+                    closing.append((a, b))
                 continue
-            own = self._maps[b]
-            a_T_b = se2.compose(joined[a, b].frame.poses[-len(own.vertices)], se2.inverse(own.poses[0]))
+            if not asked:
+                before, finding = finding, find(proposed[a, b], evidence)
+                self.findings[a, b] = finding
+                if before.joined is not None and before.joined is not finding.joined:
+                    heapq.heappush(queue, (weakness((a, b)), True))
+                    continue
+            if finding.joined is None:
+                continue
+            root, own = finding.root, self._maps[b]
+            a_T_b = se2.compose(finding.joined.frame.poses[root], se2.inverse(own.poses[0]))
             shift = se2.compose(se2.compose(at[a], a_T_b), se2.inverse(at[b]))
             for robot in groups[b]:
                 at[robot] = se2.compose(shift, at[robot])
-            tree.append((a, b))
+            _unite(groups, a, b)
             self._believe((a, b))
         for robot, own in self._maps.items():
             self._poses[self._at[robot]] = se2.compose(at[robot], own.poses)
@@ -211,11 +235,15 @@ def _groups(robots: Mapping[str, object], connected: Sequence[Pair]) -> dict[str
     """For each robot all it is connected with, the same set for all of them."""
     groups = {robot: {robot} for robot in robots}
     for a, b in connected:
-        if groups[a] is not groups[b]:
-            groups[a] |= groups[b]
-            for robot in groups[b]:
-                groups[robot] = groups[a]
+        _unite(groups, a, b)
     return groups
+
+
+def _unite(groups: dict[str, set[str]], a: str, b: str) -> None:
+    if groups[a] is not groups[b]:
+        groups[a] |= groups[b]
+        for robot in groups[b]:
+            groups[robot] = groups[a]
 
 
 def _chance(spread: FloatArray, full: BoolArray) -> FloatArray:

@@ -7,6 +7,7 @@ import gtsam
 
 from factors import Edge, EdgeId, GraphEdge, VertexId
 from mrtm.joint.graph import GraphError, JointGraph
+from mrtm.joint.own_graph import own_graph, refusal
 
 
 @dataclass(slots=True)
@@ -32,14 +33,13 @@ class JointMap:
     the same edges make the same map.
 
     Attributes:
-        refused: edges of which a version cannot be, and why; it is left out, as if it had not come.
+        refused: edges that cannot be, and why. One is left out until it comes in a higher version.
     """
 
     def __init__(self) -> None:
         self.refused: dict[EdgeId, str] = {}
-        self._refused: set[tuple[EdgeId, int]] = set()  # the versions that were
+        self._edges: dict[str, dict[EdgeId, Edge]] = {}  # the highest version of each robot's own
         self._own: dict[str, JointGraph] = {}
-        self._unconnected: dict[EdgeId, Edge] = {}
         self._component: dict[str, Component] = {}
 
     @property
@@ -70,51 +70,40 @@ class JointMap:
         Args:
             robots: names of robots heard of; one with a single vertex has no edge.
         """
-        waiting = self._unconnected
+        changed = {robot for robot in robots if robot not in self._own}
         for edge in edges:
-            if (edge.id, edge.version) in self._refused:
+            known = self._edges.setdefault(edge.id.robot, {})
+            before = known.get(edge.id)
+            if before is not None and edge.version <= before.version:
                 continue
-            if edge.id in waiting and waiting[edge.id].version >= edge.version:
+            if before is not None and (edge.tail, edge.head) != (before.tail, before.head):
+                self.refused[edge.id] = refusal(edge, f"its ends were {before.tail} and {before.head}")
                 continue
-            if _ends(edge) == {edge.id.robot}:
-                waiting[edge.id] = edge
-            else:
-                self._refuse(edge, "a robot's own edges join its own vertices")
-        for robot in {*robots, *(edge_id.robot for edge_id in waiting)} - self._own.keys():
-            self._own[robot] = JointGraph(VertexId(robot, 0))
-            self._apart([robot])
-        for robot in sorted({edge_id.robot for edge_id in waiting}):
-            self._enter(robot, [edge for edge_id, edge in sorted(waiting.items()) if edge_id.robot == robot])
+            known[edge.id] = edge
+            changed.add(edge.id.robot)
+        for robot in sorted(changed):
+            self._enter(robot)
 
-    def _enter(self, robot: str, edges: Iterable[Edge]) -> None:
-        """Enter those of a robot's waiting edges that are connected to its root."""
-        own, component = self._own[robot], self._component[robot]
-        known, present = set(own.vertices()), {edge.id: edge.version for edge in own.edges()}
-        replace = [edge for edge in edges if edge.id in present]
-        new = [edge for edge in edges if edge.id not in present]
-        add: list[Edge] = []
-        while reached := [edge for edge in new if edge.tail in known or edge.head in known]:
-            known |= {end for edge in reached for end in (edge.tail, edge.head)}
-            add += reached
-            new = [edge for edge in new if edge not in reached]
-        for edge in (*add, *replace):
-            del self._unconnected[edge.id]
-        replace = [edge for edge in replace if edge.version > present[edge.id]]
-        change = [*add, *replace]
-        try:
-            own.update(add=add, replace=replace)
-        except GraphError as error:
-            for edge in change if len(change) > 1 else ():  # one by one: which is it?
-                self._unconnected[edge.id] = edge
-                self._enter(robot, [edge])
-            if len(change) == 1:
-                self._refuse(change[0], str(error))
+    def _enter(self, robot: str) -> None:
+        """Solve a robot's edges, and bring its component up to date."""
+        edges = tuple(edge for _, edge in sorted(self._edges.get(robot, {}).items()))
+        before = self._own.get(robot)
+        self._own[robot], refused = own_graph(robot, edges)
+        self.refused |= refused
+        if before is None or self._component[robot].graph is before:
+            self._apart([robot])
             return
-        if change and component.graph is not own:
-            try:
-                component.graph.update(add=add, replace=replace)
-            except GraphError:
-                self._apart(component.robots)  # ``join`` makes it anew
+        component = self._component[robot]
+        was, now = ({edge.id: edge for edge in graph.edges()} for graph in (before, self._own[robot]))
+        try:
+            component.graph.update(
+                add=[edge for i, edge in now.items() if i not in was],
+                replace=[edge for i, edge in now.items() if i in was and edge.version > was[i].version],
+                remove=[i for i in was if i not in now],
+                remove_vertices=set(before.vertices()) - set(self._own[robot].vertices()),
+            )
+        except GraphError:
+            self._apart(component.robots)  # ``join`` makes it anew
 
     def join(self, added: Iterable[GraphEdge]) -> None:
         """Let ``added`` be all the edges beside the robots' own (M11, M13): robots come into one frame, or fall apart.
@@ -133,16 +122,17 @@ class JointMap:
                 except GraphError:
                     pass  # perhaps on the way there only
             try:
-                component = Component(robots, self._graph_of(robots, mine), mine)
+                component = self._grown(component, robots, mine) or Component(
+                    robots, self._graph_of(robots, mine), mine
+                )
             except GraphError as error:
-                self._refuse(next(iter(mine.values())), str(error))
+                self._refuse(next(iter(mine.values())), error)
                 self._apart(robots)
             else:
                 self._component.update(dict.fromkeys(robots, component))
 
-    def _refuse(self, edge: GraphEdge, reason: str) -> None:
-        self.refused[edge.id] = f"{edge}: refused: {reason}"
-        self._refused.add((edge.id, edge.version))
+    def _refuse(self, edge: GraphEdge, error: GraphError) -> None:
+        self.refused[edge.id] = refusal(edge, error)
 
     def _apart(self, robots: Iterable[str]) -> None:
         """Let every robot have its own map."""
@@ -159,6 +149,19 @@ class JointMap:
                 group.update(dict.fromkeys(b, a))
         return sorted({tuple(sorted(members)) for members in group.values()})
 
+    def _grown(self, component: Component, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> Component | None:
+        """The component with the robots that come to those it has; None if it has to be made anew."""
+        inside = set(component.robots)
+        within = {i: e for i, e in added.items() if _ends(e) <= inside}
+        if len(inside) < 2 or not inside < set(robots) or component.robots not in self.connected(within.values()):
+            return None
+        try:
+            _exchange(component, within)
+            self._merge(component.graph, inside, robots, added)
+        except GraphError:
+            return None
+        return Component(robots, component.graph, added)
+
     def _graph_of(self, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> JointGraph:
         """The robots' own graphs made one: the first one's, then the others in the order in which they are reached."""
         root = robots[0]
@@ -166,15 +169,20 @@ class JointMap:
             return self._own[root]
         graph = JointGraph(VertexId(root, 0))
         graph.update(add=self._own[root].edges())
-        reached = {root}
-        graph.update(add=[e for e in added.values() if _ends(e) == reached])
+        graph.update(add=[e for e in added.values() if _ends(e) == {root}])
+        self._merge(graph, {root}, robots, added)
+        return graph
+
+    def _merge(
+        self, graph: JointGraph, reached: set[str], robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]
+    ) -> None:
+        """Take the other robots' own graphs into that of those ``reached``, whose added edges it has."""
         while len(reached) < len(robots):
             bridge = next(e for e in added.values() if e.estimate and _ends(e) & reached and _ends(e) - reached)
             both = reached | _ends(bridge)
             more = [e for e in added.values() if e is not bridge and _ends(e) <= both and not _ends(e) <= reached]
             graph.merge(self._own[(both - reached).pop()], bridge, more)
             reached = both
-        return graph
 
 
 def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:

@@ -7,6 +7,8 @@ moved along, as a corridor does.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -44,10 +46,13 @@ SIGMAS = 3.0
 WIDEST = (1.2, 0.25)
 """Metres and radians beyond which a pose is too uncertain to be fitted, and its maps are not asked."""
 
+KEPT = 2**14  # answers
+
 MOST_PAIRS = 3
 """Pairs of local maps that are compared, those that overlap most."""
 
 _STEPS = ((0.1, 0.02), (0.05, 0.01))  # metres and radians, coarse and fine
+_RASTER = np.array([0.1, 0.1, 0.02])  # metres and radians
 _FINE = np.array([0.1, 0.1, 0.02])
 _SHIFTS = np.arange(0.6, 4.01, 0.2)
 
@@ -116,11 +121,12 @@ class MapEvidence:
                 sigma = np.sqrt(np.diag(seen.covariance))
                 if max(sigma[0], sigma[1]) < WIDEST[0] / SIGMAS and sigma[2] < WIDEST[1] / SIGMAS:
                     pose = np.array(coordinates(seen.pose))
-                    overlaps.append((overlap(self._maps[u], self._maps[v], pose), u, v, pose, sigma))
+                    question = _question(pose, sigma)
+                    overlaps.append((_overlap(self._maps[u], self._maps[v], question), u, v, question))
         overlaps.sort(key=lambda o: (-o[0], o[1], o[2]))
         said = {
-            fit(self._maps[u], self._maps[v], pose, SIGMAS * sigma).decision
-            for area, u, v, pose, sigma in overlaps[:MOST_PAIRS]
+            _decision(self._maps[u], self._maps[v], question)
+            for area, u, v, question in overlaps[:MOST_PAIRS]
             if area >= LEAST_OVERLAP
         }
         return next((word for word in (Decision.CONTRADICTS, Decision.AGREES) if word in said), Decision.UNDECIDED)
@@ -130,6 +136,29 @@ class MapEvidence:
         graph, nowhere = self._graphs[vertex.robot], UncertainPose(gtsam.Pose2(), np.zeros((3, 3)))
         owned = sorted(v for v in self._maps if v.robot == vertex.robot)
         return [(v, nowhere if v == vertex else graph.relative(v, vertex)) for v in owned]
+
+
+class _Question(NamedTuple):
+    """Where to fit two maps, in whole steps, so that next to the same is the same: pose and half widths (3,)."""
+
+    pose: tuple[float, ...]
+    half: tuple[float, ...]
+
+
+def _question(pose: FloatArray, sigma: FloatArray) -> _Question:
+    near = np.round(pose / _RASTER) * _RASTER
+    half = np.ceil(SIGMAS * sigma / _RASTER + 0.5) * _RASTER
+    return _Question(tuple(near.tolist()), tuple(half.tolist()))
+
+
+@lru_cache(KEPT)
+def _overlap(a: Lookup, b: Lookup, question: _Question) -> float:
+    return overlap(a, b, np.array(question.pose))
+
+
+@lru_cache(KEPT)
+def _decision(a: Lookup, b: Lookup, question: _Question) -> Decision:
+    return fit(a, b, np.array(question.pose), np.array(question.half)).decision
 
 
 def _around(half: FloatArray, step: float, turn: float) -> FloatArray:

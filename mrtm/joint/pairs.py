@@ -1,8 +1,9 @@
 """Whether the sightings between two robots, by themselves, tell where the robots' frames lie to each other."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import islice
+from functools import lru_cache
+from itertools import count, islice
 
 import gtsam
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from factors import UncertainPose, VertexId
 from mrtm.joint.agreement import Decision
 from mrtm.joint.consensus import Candidate, candidates
-from mrtm.joint.hypotheses import BoolArray, IntArray, Measurements, OwnMap
+from mrtm.joint.hypotheses import BoolArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
 
 Evidence = Callable[[VertexId, VertexId, UncertainPose], Decision]
 """What the local maps around two vertices of different robots say of a pose tail_T_head."""
@@ -20,6 +21,8 @@ LEAST_SUPPORT = 4
 
 LEAST_SURPLUS = 9
 """Numbers measured beyond the three an offset takes: those of four sightings with a heading, or of six without."""
+
+KEPT = 2**12  # pairs of robots as their sightings were
 
 MOST_LOOKS = 5
 """Offsets of one pair that the local maps are asked about."""
@@ -40,6 +43,7 @@ class Finding:
         lifted: whether it took the local maps to believe it.
         vetoed: sets whose offset the local maps contradict.
         rival: support of the largest set against the best one.
+        root: the row of the second robot's root in the frames of the sets.
     """
 
     sets: tuple[Candidate, ...]
@@ -47,27 +51,59 @@ class Finding:
     lifted: bool
     vetoed: tuple[Candidate, ...]
     rival: int
+    root: int
 
     def set_of(self, row: int) -> Candidate | None:
         """The set that sighting ``row`` is in."""
         return next((s for s in self.sets if s.members[row]), None)
 
 
-def find(first: OwnMap, second: OwnMap, sightings: Measurements, evidence: Evidence | None) -> Finding:
+class Proposed:
+    """Sets of sightings of one pair that agree, the largest first, found as they are asked for, and kept.
+
+    Args:
+        first, second: own maps of the two robots.
+        hypotheses: all sightings between them, in the order of their ids.
+        slack: what is added to the poses' uncertainty.
+    """
+
+    def __init__(self, first: OwnMap, second: OwnMap, hypotheses: tuple[Hypothesis, ...], slack: Slack) -> None:
+        self.vertices, self.split = first.vertices + second.vertices, len(first.vertices)
+        table = {vertex: row for row, vertex in enumerate(self.vertices)}
+        self.sightings = Measurements.of(hypotheses, table, slack)
+        self._found: list[Candidate] = []
+        self._source = candidates(first, second, self.sightings)
+
+    @staticmethod
+    @lru_cache(KEPT)
+    def of(first: OwnMap, second: OwnMap, hypotheses: tuple[Hypothesis, ...], slack: Slack) -> "Proposed":
+        """The same object for the same arguments: most pairs have nothing new when sightings are judged again."""
+        return Proposed(first, second, hypotheses, slack)
+
+    def __iter__(self) -> Iterator[Candidate]:
+        for place in count():
+            if place == len(self._found):
+                found = next(self._source, None)
+                if found is None:
+                    return
+                self._found.append(found)
+            yield self._found[place]
+
+
+def find(proposed: Proposed, evidence: Evidence | None) -> Finding:
     """Decide about one pair: the largest set, if it is large enough and clearly larger than the next.
 
     Local maps that overlap at its offset and contradict it veto it. A set that is too small, or has a rival, is
     believed if the maps agree with it and with no other.
     """
-    stream = candidates(first, second, sightings)
+    stream = iter(proposed)
     sets = list(islice(stream, 2))
     vetoed: list[Candidate] = []
-    rows = first.vertices + second.vertices
 
     def look(candidate: Candidate) -> Decision:
         if evidence is None:
             return Decision.UNDECIDED
-        return evidence(*_where(candidate, sightings, rows, len(first.vertices)))
+        return evidence(*_where(candidate, proposed.sightings, proposed.vertices, proposed.split))
 
     while sets[len(vetoed) :]:
         best, rest = sets[len(vetoed)], sets[len(vetoed) + 1 :]
@@ -76,13 +112,13 @@ def find(first: OwnMap, second: OwnMap, sightings: Measurements, evidence: Evide
         if not (enough and outnumbers(best.support, rival)):
             break
         if look(best) is not Decision.CONTRADICTS:
-            return Finding(tuple(sets), best, False, tuple(vetoed), rival)
+            return Finding(tuple(sets), best, False, tuple(vetoed), rival, proposed.split)
         vetoed.append(best)
         sets.extend(islice(stream, 1))
     looked = sets[len(vetoed) :]
     rival = looked[1].support if len(looked) > 1 else 0
     if evidence is None or not looked:
-        return Finding(tuple(sets), None, False, tuple(vetoed), rival)
+        return Finding(tuple(sets), None, False, tuple(vetoed), rival, proposed.split)
     more = list(islice(stream, MOST_LOOKS - len(looked) + 1))
     sets, looked = sets + more, (looked + more)[:MOST_LOOKS]
     unseen = max((s.support for s in sets[len(vetoed) + len(looked) :]), default=0)
@@ -90,7 +126,7 @@ def find(first: OwnMap, second: OwnMap, sightings: Measurements, evidence: Evide
     agreeing = [candidate for candidate, word in zip(looked, said, strict=True) if word is Decision.AGREES]
     vetoed += [candidate for candidate, word in zip(looked, said, strict=True) if word is Decision.CONTRADICTS]
     lifted = len(agreeing) == 1 and agreeing[0].support > unseen
-    return Finding(tuple(sets), agreeing[0] if lifted else None, lifted, tuple(vetoed), rival)
+    return Finding(tuple(sets), agreeing[0] if lifted else None, lifted, tuple(vetoed), rival, proposed.split)
 
 
 def _where(

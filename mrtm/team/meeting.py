@@ -1,6 +1,7 @@
 """M11: from the records of sightings to the edges between robots."""
 
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from factors import (
     fusing_edge,
 )
 from mrtm.joint.graph import JointGraph
-from mrtm.joint.hypotheses import Hypothesis, Slack
+from mrtm.joint.hypotheses import KEPT, Hypothesis, Slack
 from mrtm.team.records import AnchorRecord, SightingRecord
 from mrtm.team.store import Store
 
@@ -34,13 +35,18 @@ def sightings(store: Store, graphs: Mapping[str, JointGraph]) -> list[Hypothesis
             continue
         if any(a.vertex not in known.get(a.vertex.robot, ()) for a in (observer, observed)):
             continue
-        name = record.observer, record.number
-        found.append(
-            Hypothesis(name, observer.vertex, observed.vertex, record.measurement, observer.pose, observed.pose)
-        )
+        found.append(_hypothesis(record, observer, observed))
     return found
 
 
+@lru_cache(KEPT)
+def _hypothesis(record: SightingRecord, observer: AnchorRecord, observed: AnchorRecord) -> Hypothesis:
+    """One object for the same records, whoever holds them: what follows from it need not be found again."""
+    name = record.observer, record.number
+    return Hypothesis(name, observer.vertex, observed.vertex, record.measurement, observer.pose, observed.pose)
+
+
+@lru_cache(KEPT)
 def anchored(hypothesis: Hypothesis, slack: Slack) -> AnchoredSighting:
     """A believed sighting for fusing; both robots' poses have the ``slack`` that all sightings turned out to need."""
     more = np.diag([slack.xy, slack.xy, slack.theta]) ** 2
@@ -59,10 +65,19 @@ def fusing_edges(believed: Iterable[AnchoredSighting]) -> list[Edge | SightingEd
         pairs.setdefault((min(ends), max(ends)), []).append(sighting)
     edges: list[Edge | SightingEdge] = []
     for (tail, head), between in sorted(pairs.items()):
-        name = f"{tail}-{head}"
-        edge = fusing_edge(EdgeId(name, 0), 0, between)
-        edges.extend([edge] if edge else [SightingEdge(EdgeId(name, n), 0, s) for n, s in enumerate(between, 1)])
+        edges.extend(_between(tail, head, tuple(between)))
     return edges
+
+
+@lru_cache(KEPT)
+def _between(tail: VertexId, head: VertexId, sightings: tuple[AnchoredSighting, ...]) -> list[Edge | SightingEdge]:
+    name = f"{tail}-{head}"
+    edge = fusing_edge(EdgeId(name, 0), 0, sightings)
+    if edge is not None:
+        return [edge]
+    # One with a heading that yet fixes no pose comes from where a robot hardly knew its own: it adds nothing.
+    alone = [(n, s) for n, s in enumerate(sightings, 1) if s.sighting.heading is None]
+    return [SightingEdge(EdgeId(name, n), 0, s) for n, s in alone]
 
 
 def bridges(offsets: Mapping[tuple[str, str], UncertainPose], edges: Iterable[GraphEdge]) -> list[Edge]:

@@ -41,24 +41,32 @@ def play(
         sightings: between them, by team time.
         report: told now and then which fraction of the meetings has passed.
     """
-    playback = _Playback(runs, sightings, config)
+    playback = Playback(runs, sightings, config)
     playback.play(report)
     return playback.result(config)
 
 
-class _Playback:
+class Playback:
+    """See ``play``.
+
+    Attributes:
+        team: the robots, by name.
+        listener: somebody who in the end hears all.
+    """
+
     def __init__(self, runs: Sequence[MemberRun], sightings: Sequence[TimedSighting], config: Config) -> None:
         self._runs = runs
         self._config = config
         self._stages = Stages()
         peers = Peers()
-        self._team = {run.robot: Teammate(run.robot, config, self._stages, peers) for run in runs}
-        self._listener = Teammate(None, config, self._stages, peers)
+        self.team = {run.robot: Teammate(run.robot, config, self._stages, peers) for run in runs}
+        self.listener = Teammate(None, config, self._stages, peers)
         self._sightings = _numbered(sightings)
         self._meetings: list[Meeting] = []
         self._frames: list[tuple[float, frozenset[str]]] = []  # team time and robots of every new component
 
     def play(self, report: Callable[[float], None]) -> None:
+        """All meetings, and what the listener makes of it all in the end."""
         meetings = _meetings(self._sightings, self._config.team.exchange_interval)
         told = deque[tuple[float, Record]](
             heapq.merge(
@@ -74,23 +82,41 @@ class _Playback:
             report(number / len(meetings))
         for _, record in told:
             self._write_down(record)
-        for teammate in (*(self._team.values() if len(self._team) > 1 else ()), self._listener):
+        for teammate in self.team.values():
+            teammate.learn()
+        self.listener.settle()
+
+    def agree(self) -> bool:
+        """Let all robots meet once more, and tell whether every joint map is then the listener's, pose by pose."""
+        for _ in range(2):  # to the first and back
+            first, *others = self.team.values()
+            for other in others:
+                exchange(first.store, other.store)
+        poses = [c.graph.estimates() for c in self.listener.joint.components()]
+        for teammate in self.team.values():
             teammate.settle()
+            found = [c.graph.estimates() for c in teammate.joint.components()]
+            if [set(c) for c in found] != [set(c) for c in poses]:
+                return False
+            if any(not p.equals(b[v], 1e-9) for a, b in zip(found, poses, strict=True) for v, p in a.items()):
+                return False
+        return True
 
     def _write_down(self, record: Record) -> None:
         with self._stages("exchange"):
             packed = item_of(pack(record))
-            for teammate in (self._team[record.key.robot], self._listener):
+            for teammate in (self.team[record.key.robot], self.listener):
                 teammate.store.add(packed)
 
     def _meet(self, time: float, robots: tuple[str, str]) -> None:
         """M10 and M11."""
-        one, other = (self._team[robot] for robot in robots)
+        one, other = (self.team[robot] for robot in robots)
         with self._stages("exchange"):
             traffic = exchange(one.store, other.store)
         for teammate in (one, other):
-            teammate.think()
-            teammate.align()
+            if teammate.is_due():
+                teammate.think()
+                teammate.align()
             for robot in teammate.joint.robots.keys() & {teammate.name}:  # none if it has not taken a scan yet
                 self._frames.append((time, frozenset(teammate.joint.component(robot).robots)))
         verdict, reason = _verdict(one, robots)
@@ -98,7 +124,7 @@ class _Playback:
 
     def result(self, config: Config) -> RunResult:
         """What is known at the end, in the joint maps of the listener."""
-        joint = self._listener.joint
+        joint = self.listener.joint
         components = joint.components()
         poses = {v: pose for c in components for v, pose in c.graph.estimates().items()}
         edges = [fate for run in self._runs for fate in run.past]
@@ -128,19 +154,19 @@ class _Playback:
         )
 
     def _story(self) -> TeamStory:
-        largest = max((frozenset(c.robots) for c in self._listener.joint.components()), key=len)
+        largest = max((frozenset(c.robots) for c in self.listener.joint.components()), key=len)
         together = [time for time, robots in self._frames if robots >= largest]
         return TeamStory(
             meetings=self._meetings,
             sightings=[self._fate(sighting) for sighting in self._sightings],
             first_meeting=self._meetings[0].time if self._meetings else None,
             common_frame=together[0] if together and len(largest) > 1 else None,
-            known={name: _known(teammate) for name, teammate in self._team.items()},
+            known={name: _known(teammate) for name, teammate in self.team.items()},
         )
 
     def _fate(self, sighting: SightingRecord) -> SightingFate:
         ends = sighting.time, sighting.observer, sighting.observed
-        judgement = self._listener.judgements.get((sighting.observer, sighting.number))
+        judgement = self.listener.judgements.get((sighting.observer, sighting.number))
         if judgement is None:
             return SightingFate(*ends, "refused", "no scan at that time: where the robots were is not known")
         numbers = {"support": float(judgement.support), "rival": float(judgement.rival)}

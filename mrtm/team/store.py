@@ -80,6 +80,7 @@ class Store:
     def __init__(self) -> None:
         self._items: dict[str, dict[tuple[Kind, int], Item]] = {}
         self._hashes: dict[str, bytes] = {}  # of each writer's items, as far as they are known
+        self._parts: dict[tuple[str, Kind], tuple[Item, ...]] = {}  # those of one writer and kind, likewise
 
     def put(self, record: Record) -> bool:
         """Learn a record; False if it, or a higher version, is known already.
@@ -99,6 +100,7 @@ class Store:
             return False
         known[place] = item
         self._hashes.pop(item.key.robot, None)
+        self._parts.pop((item.key.robot, item.key.kind), None)
         return True
 
     def merge(self, records: Iterable[Record]) -> list[Key]:
@@ -126,16 +128,27 @@ class Store:
     def keys(self, kind: Kind) -> Iterator[Key]:
         """The keys of one kind, by robot and number."""
         for robot in sorted(self._items):
-            yield from (Key(kind, robot, number) for found, number in sorted(self._items[robot]) if found == kind)
+            yield from (item.key for item in self.part(robot, kind))
 
     def of(self, kind: type[R]) -> Iterator[R]:
         """The records of one type, by robot and number; maps are unpacked one after the other."""
         for robot in sorted(self._items):
-            for (found, _), item in sorted(self._items[robot].items()):
-                if found == kind.kind:
-                    record = item.record
-                    assert isinstance(record, kind)
-                    yield record
+            for item in self.part(robot, kind.kind):
+                record = item.record
+                assert isinstance(record, kind)
+                yield record
+
+    def count(self, kind: type[R]) -> int:
+        """How many records of one type there are."""
+        return sum(len(self.part(robot, kind.kind)) for robot in self._items)
+
+    def part(self, robot: str, kind: Kind) -> tuple[Item, ...]:
+        """The items of one writer and kind, by number."""
+        name = robot, kind
+        if name not in self._parts:
+            known = self._items.get(robot, {})
+            self._parts[name] = tuple(item for (found, _), item in sorted(known.items()) if found == kind)
+        return self._parts[name]
 
     def records(self) -> Iterator[Record]:
         """All records, topology first; maps, which come last, are unpacked one after the other."""

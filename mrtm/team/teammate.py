@@ -8,11 +8,11 @@ import numpy as np
 
 from factors import Edge, EdgeId, GraphEdge, SightingEdge
 from mrtm.config import Config
-from mrtm.joint.aligner import Aligner
+from mrtm.joint.aligner import Aligner, Alignments
 from mrtm.joint.consistency import Judgement, Verdict, judge
 from mrtm.joint.hypotheses import HypothesisId
 from mrtm.joint.joint_map import Component, JointMap
-from mrtm.team.evidence import Evidence
+from mrtm.team.evidence import Answers, Evidence
 from mrtm.team.meeting import anchored, bridges, fusing_edges, sightings
 from mrtm.team.records import EdgeRecord, Key, SightingRecord, VertexRecord
 from mrtm.team.store import R, Store
@@ -30,12 +30,18 @@ class Peers:
     Attributes:
         concluded: what sightings come to, by the hash of the store.
         settled: what all comes to, likewise.
+        answers: of the maps.
+        alignments: of maps.
     """
 
     def __init__(self) -> None:
         self.concluded: dict[bytes, _Conclusion] = {}
         self.settled: dict[bytes, Teammate] = {}
+        self.answers: Answers = {}
+        self.alignments = Alignments()
 
+
+GROWN = 1.1  # times as much is known
 
 ROUNDS = 10  # of alignments until the estimate has come to rest, at most
 
@@ -67,15 +73,16 @@ class Teammate:
         self.store = Store() if store is None else store
         self.joint = JointMap()
         self.judgements: Mapping[HypothesisId, Judgement] = {}
-        self.aligner = Aligner()
+        self.aligner = Aligner(peers.alignments)
         self._config = config
         self._stages = stages
         self._peers = peers
         self._maps = Surfaces(self.store)
-        self._evidence = Evidence(self._maps, self.joint, self.aligner)
+        self._evidence = Evidence(self._maps, self.joint, peers.answers)
         self._fusing: dict[EdgeId, Edge | SightingEdge] = {}
         self._told: dict[Key, int] = {}  # version of each record that the joint map knows
         self._held = b""  # the hash of what was known when sightings were last judged
+        self._thought = 0, 0  # how many records, and sightings, were known at the last ``think``
 
     def judgements_between(self, robots: tuple[str, str]) -> dict[HypothesisId, Judgement]:
         """The judgements of sightings between two robots."""
@@ -83,14 +90,29 @@ class Teammate:
         ids = [(r.observer, r.number) for r in between]
         return {key: self.judgements[key] for key in ids if key in self.judgements}
 
-    def think(self) -> None:
-        """Bring the joint map up to date with the records."""
+    def is_due(self) -> bool:
+        """Whether there are GROWN times as many records or sightings to go by as at the last ``think``.
+
+        Who thinks only then spends on all the thinking about a growing store a fixed number of times the last.
+        """
+        return any(now >= GROWN * max(before, 1) for now, before in zip(self._size(), self._thought, strict=True))
+
+    def learn(self) -> None:
+        """Bring the robots' own maps up to date with the records."""
         robots = {record.id.robot for record in self._news(VertexRecord)}
         edges = [record.edge for record in self._news(EdgeRecord)]
         with self._stages("joint map"):
             self.joint.learn(edges, robots)
+
+    def think(self) -> None:
+        """Bring the joint map up to date with the records."""
+        self._thought = self._size()
+        self.learn()
         if self.store.summary() != self._held:
             self._fuse()
+
+    def _size(self) -> tuple[int, int]:
+        return len(self.store), self.store.count(SightingRecord)
 
     def settle(self) -> None:
         """``think`` and ``align`` anew, from the records alone; with this the robot is at its end.
@@ -143,7 +165,7 @@ class Teammate:
                 while len(concluded) > KEPT:
                     del concluded[next(iter(concluded))]
             self.judgements, edges = concluded[held]
-        self._held = held
+            self._held = held
         self._fusing = {edge.id: self._versioned(edge) for edge in edges}
         self._enter()
 
