@@ -2,6 +2,7 @@
 
 Without an option: every log at hand, mrtm and the installed peers side by side, as a dated table and a plot in
 ``tools/results``. ``--stages LOG``: where the time of one run goes. ``--day``: ten simulated hours, cost hour by hour.
+``--backend``: the joint graph alone, fed public pose graphs edge by edge, beside bare iSAM2.
 """
 
 import tempfile
@@ -12,12 +13,15 @@ import typer
 
 from mrtm.config import Config
 from tools.bench.anchors import read_anchors
+from tools.bench.backend import BACKENDS, Fed, backend_report, feed, solve
+from tools.bench.backend_picture import draw_backend
 from tools.bench.bars import draw_day, draw_profile
 from tools.bench.day import day_report, drive_day
 from tools.bench.logs import BenchLog, find_logs, places
 from tools.bench.machine import setting
 from tools.bench.peers import PEERS
 from tools.bench.plot import draw
+from tools.bench.pose_graphs import PoseGraph, find_pose_graphs
 from tools.bench.process import ProcessError
 from tools.bench.stages import profile, stages_report
 from tools.bench.suite import LogReport, run_log, warm_up
@@ -33,6 +37,7 @@ app = typer.Typer(add_completion=False)
 def main(
     stages: Annotated[str, typer.Option(metavar="LOG", help="Profile one run of a log: a name or a file.")] = "",
     day: Annotated[bool, typer.Option("--day", help="Drive a simulated day.")] = False,
+    backend: Annotated[bool, typer.Option("--backend", help="Feed pose graphs to the joint graph.")] = False,
     logs: Annotated[list[str] | None, typer.Option("--log", help="Only this log; repeatable.")] = None,
     runs: Annotated[int, typer.Option(min=1, help="Runs of mrtm for each log.")] = 5,
     peer_runs: Annotated[int, typer.Option(min=0, help="Runs of each peer, 0 for none.")] = 1,
@@ -41,6 +46,7 @@ def main(
     hours: Annotated[float, typer.Option(min=1, help="Of the simulated day.")] = 10.0,
     rate: Annotated[float, typer.Option(min=0.1, help="Scans a second of the simulated day.")] = 1.0,
     building: Annotated[str, typer.Option(help=f"Of the simulated day: {', '.join(BUILDINGS)}.")] = "office",
+    poses: Annotated[int | None, typer.Option(min=2, help="Of the pose graphs; all if not given.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for the report.")] = RESULTS,
     note: Annotated[str, typer.Option(help="Put on top of the report, such as: preliminary.")] = "",
 ) -> None:
@@ -54,6 +60,8 @@ def main(
             written = _stages(path, chosen, limit, out, note)
         elif day:
             written = _day(found["demo"], building, hours, rate, chosen, out, note)
+        elif backend:
+            written = _backend(poses, out, note)
         else:
             unknown = [name for name in logs or () if name not in found]
             if unknown:
@@ -116,6 +124,21 @@ def _day(
     draw_day(measured, picture, note)
     text.write_text(day_report(measured, here, options, note, picture.name))
     return text
+
+
+def _backend(poses: int | None, out: Path, note: str) -> Path:
+    graphs = find_pose_graphs(places(), poses)
+    if not graphs:
+        raise ProcessError("no pose graphs here: set MRTM_DATA to a directory that has them in posegraphs/")
+    here = setting()
+    table, picture = _names(out, here.day.isoformat(), "backend")
+    measured: list[tuple[PoseGraph, list[Fed]]] = []
+    for graph in graphs:
+        fed = [feed(graph, name, lambda line: typer.echo(line, err=True)) for name in BACKENDS]
+        measured.append((graph, [*fed, solve(graph)]))
+        draw_backend(measured, picture, note)
+        table.write_text(backend_report(measured, here, note, picture.name))
+    return table
 
 
 def _given(options: tuple[str, ...]) -> list[str]:

@@ -1,5 +1,6 @@
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,9 @@ class World:
         return [self.edge(i, i, i + 1) for i in range(len(self.truth) - 1)]
 
 
-def batch_optimum(graph: JointGraph, start: dict[VertexId, gtsam.Pose2]) -> dict[VertexId, gtsam.Pose2]:
+def batch_optimum(
+    graph: JointGraph, start: dict[VertexId, gtsam.Pose2], solver: str = "MULTIFRONTAL_CHOLESKY"
+) -> dict[VertexId, gtsam.Pose2]:
     """Levenberg-Marquardt over the edges the graph says it has, from elsewhere."""
     keys = {v: i for i, v in enumerate(graph.vertices())}
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -79,6 +82,7 @@ def batch_optimum(graph: JointGraph, start: dict[VertexId, gtsam.Pose2]) -> dict
     params.setRelativeErrorTol(1e-15)
     params.setAbsoluteErrorTol(1e-15)
     params.setMaxIterations(200)
+    params.setLinearSolverType(solver)
     result = gtsam.LevenbergMarquardtOptimizer(factors, values, params).optimize()
     return {v: result.atPose2(key) for v, key in keys.items()}
 
@@ -260,6 +264,89 @@ def test_levenberg_marquardt_takes_over_where_gauss_newton_does_not_settle(
     monkeypatch.setattr(smoother, "_MAX_STEPS", 0)
     again = built(graph.edges())
     assert distance(again.estimates(), graph.estimates()) < 1e-4
+
+
+def test_a_second_step_that_fails_takes_back_the_first(
+    looped: tuple[World, JointGraph], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A vertex is gone from the solver and a new one in it, when the strained loop's own update gives up."""
+    world, graph = looped
+    before, edges, plain, calls = graph.estimates(), graph.edges(), smoother.Smoother.update, []
+
+    def give_up_later(solver: smoother.Smoother, *change: Any) -> None:
+        calls.append(change)
+        if len(calls) > 1:
+            raise RuntimeError("Indeterminate linear system")
+        plain(solver, *change)
+
+    new = Edge(
+        EdgeId("red", 80), 0, EdgeKind.INTER_VERTEX, vertex(8), vertex(20), gtsam.Pose2(3.0, 0.0, 0.0), STEP_COVARIANCE
+    )
+    strained = world.edge(81, 5, 0, EdgeKind.LOOP, off=(3.0, 0.0, 0.0))
+    with monkeypatch.context() as patch:
+        patch.setattr(smoother.Smoother, "update", give_up_later)
+        with pytest.raises(GraphError, match="cannot be solved with this change"):
+            graph.update(remove_vertices=[vertex(9)], add=[new, strained])
+    assert len(calls) == 2
+    assert graph.edges() == edges
+    assert distance(graph.estimates(), before) < 1e-6
+    graph.update(remove_vertices=[vertex(9)], add=[new])
+    assert distance(graph.estimates(), batch_optimum(graph, graph.estimates())) < 1e-4
+
+
+def laps(count: int, lap: int) -> tuple[World, list[Edge]]:
+    """Rounds of a ring of ``lap`` vertices 5 m apart, with a loop to the round before at every tenth vertex."""
+    world = World(17, 1)
+    step = gtsam.Pose2(5.0, 0.0, 2.0 * np.pi / lap)
+    while len(world.truth) < count:
+        world.truth.append(world.truth[-1].compose(step))
+    edges = []
+    for i in range(1, count):
+        edges.append(world.edge(i, i - 1, i))
+        if i >= lap and i % 10 == 0:
+            edges.append(world.edge(count + i, i, i - lap, EdgeKind.LOOP))
+    return world, edges
+
+
+def test_a_large_graph_stays_within_millimetres_and_ends_at_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(smoother, "_LARGE", 200)
+    _, edges = laps(400, 100)
+    graph, off = JointGraph(vertex(0)), []
+    for number, edge in enumerate(edges):
+        graph.update(add=[edge])
+        if number % 40 == 0 and len(graph.vertices()) > 200:
+            off.append(distance(graph.estimates(), batch_optimum(graph, graph.estimates())))
+    assert len(off) > 4
+    assert max(off) < 0.005
+    graph.optimize_fully()
+    assert distance(graph.estimates(), batch_optimum(graph, graph.estimates())) < 1e-6
+
+
+@pytest.mark.parametrize("most", [20, 1000])  # variables that are solved to the last digit
+def test_where_cholesky_gives_up_qr_goes_on(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+    """With a vertex removed, one replaced and a loop in the same update."""
+    monkeypatch.setattr(smoother, "_LARGE", most)
+    world = World(18, 30)
+    graph = built([*world.chain(), world.edge(50, 29, 2, EdgeKind.LOOP)])
+    wide = np.diag([4.0, 1e-9, 1e-10])
+    tight = [replace(world.edge(60 + i, 25, 10 + i), covariance=wide) for i in range(3)]
+    change: dict[str, Any] = {
+        "remove_vertices": [vertex(29)],
+        "replace": [world.edge(4, 4, 5, EdgeKind.COVARIANCE_INTERSECTION, version=1)],
+        "add": [*tight, world.edge(70, 28, 2, EdgeKind.LOOP)],
+    }
+    asked: list[str] = []
+    plain = smoother._parameters
+
+    def remember(tolerance: smoother._Tolerance, factorization: str) -> gtsam.ISAM2Params:
+        asked.append(factorization)
+        return plain(tolerance, factorization)
+
+    monkeypatch.setattr(smoother, "_parameters", remember)
+    graph.update(**change)
+    assert "QR" in asked
+    assert len(graph.vertices()) == 29
+    assert distance(graph.estimates(), batch_optimum(graph, graph.estimates(), "MULTIFRONTAL_QR")) < 1e-3
 
 
 def test_solves_covariances_of_very_different_size() -> None:
