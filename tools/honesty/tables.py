@@ -15,6 +15,7 @@ KINDS = (
     str(EdgeKind.COVARIANCE_INTERSECTION),
     str(EdgeKind.LOOP),
     ENTERING,
+    str(EdgeKind.ALIGNMENT),
     VERTEX,
 )
 ALL = "all"
