@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
+from itertools import islice
 from typing import NamedTuple
 
 import gtsam
@@ -53,14 +54,10 @@ def pairs(
     apart -= circles[:, None, 2] + circles[None, :, 2]
     i, k = np.nonzero(np.triu(apart <= MAX_XY, 1))
     found: list[tuple[float, Candidate]] = []
-    left = len(i) if looks is None else looks
-    for place in np.argsort(apart[i, k], kind="stable").tolist():
-        a, b, distance = vertices[i[place]], vertices[k[place]], apart[i[place], k[place]]
-        if not wanted(a, b):
-            continue
-        if left == 0:
-            break
-        left -= 1
+    nearest = ((int(i[place]), int(k[place])) for place in np.argsort(apart[i, k], kind="stable"))
+    asked = islice(((a, b) for a, b in nearest if wanted(vertices[a], vertices[b])), looks)
+    for row, column in sorted(asked):  # one ``a`` after the other: the first question about it takes long
+        a, b, distance = vertices[row], vertices[column], apart[row, column]
         guess = relative(a, b)
         if distance > 3.0 * np.sqrt(np.linalg.eigvalsh(guess.covariance[:2, :2])[1]):
             continue

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from factors import Edge, EdgeId, VertexId
 from mrtm.joint.graph import GraphError, JointGraph
 
-KEPT = 512  # graphs
+KEPT = 256  # graphs
 
 
 class OwnGraph(NamedTuple):

@@ -41,6 +41,9 @@ _LARGE = 1000  # variables
 
 _MAX_STEPS = 30
 
+# Factors in all the eliminations that are kept for further questions, seen from one pose each: about 10 kB a factor.
+_KEPT = 1_000
+
 # Standard deviation that stands for "this pose is the reference": nothing against any measurement.
 _REFERENCE_SIGMA = 1e-6
 
@@ -147,6 +150,8 @@ class Smoother:
             graph.push_back(gtsam.PriorFactorPose2(reference, self.pose(reference), noise))
             self._seen_from[reference] = gtsam.ISAM2(_parameters(_EXACT, "QR"))
             self._seen_from[reference].update(graph, self.values())
+            while len(self._seen_from) > 1 and len(self._seen_from) * len(self._factors) > _KEPT:
+                del self._seen_from[next(iter(self._seen_from))]
         return _symmetric(self._seen_from[reference].marginalCovariance(key))
 
     def relative_covariance(self, reference: int, key: int) -> FloatArray:
