@@ -1,6 +1,5 @@
 """The command ``mrtm``: parse, call, print. Everything heavy is imported by the command that needs it."""
 
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -57,7 +56,7 @@ def run(
     quiet: Quiet = False,
 ) -> None:
     """Map a building with a team of robots, or from one robot's log."""
-    parameters = _parameters(config, preset, options, seed, threads)
+    parameters = _parameters(config, preset, options, seed)
     from mrtm.progress import showing
     from mrtm.session import run_session
 
@@ -81,7 +80,7 @@ def compare(
     quiet: Quiet = False,
 ) -> None:
     """Make the joint map three ways: before optimisation, by the paper's off-line EM, and on line."""
-    parameters = _parameters(config, preset, options, seed, threads)
+    parameters = _parameters(config, preset, options, seed)
     from mrtm.progress import showing
     from mrtm.session import compare_session
 
@@ -185,14 +184,9 @@ def _print(parts: "Sequence[RenderableType]") -> None:
         console.print(part)
 
 
-def _parameters(
-    file: Path | None, preset: str | None, options: Sequence[str] | None, seed: int | None, threads: int | None
-) -> "Config":
-    """The parameters of a run, and the number of threads set, before anything imports numba."""
-    parameters = _load(file, preset, [*(options or ()), *([] if seed is None else [f"seed={seed}"])])
-    if threads is not None:
-        os.environ["NUMBA_NUM_THREADS"] = str(threads)  # numba reads it when it is imported
-    return parameters
+def _parameters(file: Path | None, preset: str | None, options: Sequence[str] | None, seed: int | None) -> "Config":
+    """The parameters of a run."""
+    return _load(file, preset, [*(options or ()), *([] if seed is None else [f"seed={seed}"])])
 
 
 def _load(file: Path | None, preset: str | None, options: Sequence[str]) -> "Config":

@@ -8,6 +8,7 @@ from pathlib import Path
 from frontend.records import LaserScan
 from mrtm.compare import Score, compare
 from mrtm.config import Config
+from mrtm.cores import limited_to
 from mrtm.output.export import export
 from mrtm.progress import Progress
 from mrtm.result import RunResult
@@ -65,15 +66,15 @@ def compare_session(
 def map_session(session: TeamSession, config: Config, progress: Progress, cores: int | None = None) -> RunResult:
     """Map a session; nothing is written. Arguments and errors as of ``run_session``."""
     started = time.perf_counter()
-    runs = map_members(
-        session, config, cores or os.cpu_count() or 1, lambda done, doing: progress(FRONT_ENDS * done, doing)
-    )
-    result = play(
-        runs,
-        session.sightings,
-        config,
-        lambda done: progress(FRONT_ENDS + (1.0 - FRONT_ENDS) * done, "meetings and joint map"),
-    )
+    cores = cores or os.cpu_count() or 1
+    with limited_to(cores):
+        runs = map_members(session, config, cores, lambda done, doing: progress(FRONT_ENDS * done, doing))
+        result = play(
+            runs,
+            session.sightings,
+            config,
+            lambda done: progress(FRONT_ENDS + (1.0 - FRONT_ENDS) * done, "meetings and joint map"),
+        )
     result.timings["total"] = time.perf_counter() - started
     return result
 

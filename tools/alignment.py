@@ -1,6 +1,5 @@
 """How good is alignment? ``python -m tools.alignment --seeds 4`` measures it on pairs of maps from simulated drives."""
 
-import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -30,7 +29,6 @@ def main(
     out: Annotated[Path, typer.Option(help="Folder for alignment.png.")] = Path("out"),
 ) -> None:
     """Drive two robots through each building, align all pairs of their maps, and hold the result against the truth."""
-    os.environ["NUMBA_NUM_THREADS"] = "1"
     import numpy as np
 
     from tools.aligning.figure import draw

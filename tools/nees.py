@@ -13,6 +13,8 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
+from mrtm.cores import use_cores
+
 if TYPE_CHECKING:
     from tools.honesty.runs import Honesty
 
@@ -42,7 +44,6 @@ def main(
     Writes the tables as nees.md and the figure as nees.png. Real logs have no truth: what they tell is whether
     re-entries and repeated measurements of an edge agree within the covariances claimed.
     """
-    os.environ["NUMBA_NUM_THREADS"] = "1"  # for this process, which imports numba below, and for its children
     from frontend.errors import FrontendError
     from mrtm.errors import MrtmError
     from tools.bench.machine import setting
@@ -92,7 +93,7 @@ def _all(work: "list[tuple[Callable[..., Honesty], tuple[object, ...]]]", jobs: 
     if not work:
         return []
     # Spawned, not forked: numba's threads and the environment start anew.
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), use_cores, (1,)) as pool:
         futures: list[Future[Honesty]] = [pool.submit(function, *arguments) for function, arguments in work]
         for done in track(as_completed(futures), total=len(futures), description="runs", console=Console(stderr=True)):
             done.result()

@@ -16,6 +16,8 @@ import typer
 from rich.console import Console
 from rich.progress import track
 
+from mrtm.cores import use_cores
+
 if TYPE_CHECKING:
     from tools.bench.logs import BenchLog
 
@@ -92,7 +94,6 @@ def main(
     out: Annotated[Path, typer.Option(help="Folder for sweep.md.")] = Path("tools/results"),
 ) -> None:
     """Map everything with every seed and every change; print and write the spread, and which maps broke."""
-    os.environ["NUMBA_NUM_THREADS"] = "1"  # for the children
     from tools.bench.logs import find_logs, places
     from tools.bench.machine import setting
 
@@ -106,7 +107,7 @@ def main(
     names = [name for name in plans.split(",") if name]
     buildings = [(in_building, (n, c, s)) for s, n, c in itertools.product(_range(first_seed, seeds), names, changes)]
     # Spawned, not forked: numba's threads and the environment start anew.
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), use_cores, (1,)) as pool:
         futures = [pool.submit(f, *arguments) for f, arguments in work]
         futures += [pool.submit(f, *arguments) for f, arguments in buildings]
         outcomes = [future.result() for future in track(futures, "runs", console=Console(stderr=True))]

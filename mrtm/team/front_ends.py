@@ -1,7 +1,6 @@
 """The front ends of a team at work: a process a robot, as many at once as there are cores."""
 
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -12,6 +11,7 @@ from frontend.ahead import ahead
 from frontend.rbpf import first_run
 from frontend.readers import open_log
 from mrtm.config import Config
+from mrtm.cores import use_cores
 from mrtm.progress import Progress
 from mrtm.team.member import MemberRun, map_member
 from mrtm.team.playback import sighting_times
@@ -62,33 +62,26 @@ def _map_alone(job: _Job, progress: Progress) -> MemberRun:
 def _map_side_by_side(jobs: Sequence[_Job], at_once: int, threads: int, progress: Progress) -> list[MemberRun]:
     context = multiprocessing.get_context("spawn")  # numba's threads do not survive a fork
     done: SynchronizedArray[float] = context.Array("d", len(jobs))
-    before = os.environ.get("NUMBA_NUM_THREADS")
-    os.environ["NUMBA_NUM_THREADS"] = str(threads)  # numba reads it when the new process imports it
-    try:
-        with ProcessPoolExecutor(at_once, context, _start, (done,)) as pool:
-            results = [pool.submit(_map_in_process, job) for job in jobs]
-            while not all(result.done() for result in results):
-                ready = sum(result.done() for result in results)
-                progress(sum(done[:]) / len(jobs), f"{ready} of {len(jobs)} robots mapped")
-                failed = next((r for r in results if r.done() and r.exception() is not None), None)
-                if failed is not None:
-                    pool.shutdown(wait=False, cancel_futures=True)
-                    break
-                time.sleep(LOOK)
-            return [result.result() for result in results if not result.cancelled()]
-    finally:
-        if before is None:
-            del os.environ["NUMBA_NUM_THREADS"]
-        else:
-            os.environ["NUMBA_NUM_THREADS"] = before
+    with ProcessPoolExecutor(at_once, context, _start, (done, threads)) as pool:
+        results = [pool.submit(_map_in_process, job) for job in jobs]
+        while not all(result.done() for result in results):
+            ready = sum(result.done() for result in results)
+            progress(sum(done[:]) / len(jobs), f"{ready} of {len(jobs)} robots mapped")
+            failed = next((r for r in results if r.done() and r.exception() is not None), None)
+            if failed is not None:
+                pool.shutdown(wait=False, cancel_futures=True)
+                break
+            time.sleep(LOOK)
+        return [result.result() for result in results if not result.cancelled()]
 
 
 _done: "SynchronizedArray[float]"
 
 
-def _start(done: "SynchronizedArray[float]") -> None:
+def _start(done: "SynchronizedArray[float]", threads: int) -> None:
     global _done
     _done = done
+    use_cores(threads)
 
 
 def _map_in_process(job: _Job) -> MemberRun:
