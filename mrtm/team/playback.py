@@ -17,7 +17,7 @@ from mrtm.team.codec import pack
 from mrtm.team.exchange import exchange
 from mrtm.team.member import MemberRun
 from mrtm.team.records import Record, SightingRecord
-from mrtm.team.session_file import TimedSighting
+from mrtm.team.sightings_file import TimedSighting, sighting_times
 from mrtm.team.store import item_of
 from mrtm.team.teammate import Peers, Teammate
 from mrtm.timing import Stages
@@ -192,11 +192,6 @@ def _numbered(sightings: Sequence[TimedSighting]) -> list[SightingRecord]:
         )  # fmt: skip
         count[s.observer] += 1
     return records
-
-
-def sighting_times(sightings: Iterable[TimedSighting], robot: str) -> list[float]:
-    """Team times at which somebody saw the robot or was seen by it, ascending, each once."""
-    return sorted({s.time for s in sightings if robot in (s.observer, s.observed)})
 
 
 def _meetings(sightings: Iterable[SightingRecord], interval: float) -> list[tuple[float, tuple[str, str]]]:

@@ -8,7 +8,7 @@ in seconds of team time, metres and radians. ``heading`` and ``sigma_heading`` m
 import csv
 import difflib
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -39,6 +39,11 @@ _Metres = Annotated[float, Field(gt=0.0, lt=1e4)]
 _Angle = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi)]  # degrees would mostly be beyond
 _Sigma = Annotated[float, Field(ge=1e-6, lt=1e4)]  # so that its square is a variance
 _BlankIsNone = BeforeValidator(lambda text: text.strip() or None)
+
+
+def sighting_times(sightings: Iterable[TimedSighting], robot: str) -> list[float]:
+    """Team times at which somebody saw the robot or was seen by it, ascending, each once."""
+    return sorted({s.time for s in sightings if robot in (s.observer, s.observed)})
 
 
 class _Row(BaseModel):

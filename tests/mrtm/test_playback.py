@@ -20,8 +20,9 @@ from mrtm.result import RunResult, TeamStory
 from mrtm.team import playback
 from mrtm.team.exchange import Traffic, exchange
 from mrtm.team.member import MemberRun
-from mrtm.team.playback import LINGER, play, sighting_times
+from mrtm.team.playback import LINGER, play
 from mrtm.team.records import AnchorRecord, Kind
+from mrtm.team.sightings_file import sighting_times
 from mrtm.team.store import Store
 from tests.mrtm.sighting_world import TeamWorld
 from tests.mrtm.team_world import BETWEEN, NO_MAPS, chain, run_of, timed
