@@ -46,10 +46,11 @@ def _at_once(jobs: int, cores: int) -> int:
 
 
 def _map_side_by_side(jobs: Sequence[MappingJob], at_once: int, cores: int, progress: Progress) -> list[MemberRun]:
-    context = multiprocessing.get_context("spawn")  # numba's threads do not survive a fork
+    # Forked from a process that has imported all and started nothing: numba's threads do not survive a fork.
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([map_in_process.__module__])
     done: SynchronizedArray[float] = context.Array("d", len(jobs))
-    pool = ProcessPoolExecutor(at_once, context, start_process, (done, cores, at_once))
-    try:
+    with ProcessPoolExecutor(at_once, context, start_process, (done, cores, at_once)) as pool:
         results = [pool.submit(map_in_process, job) for job in jobs]
         busy = set(results)
         while busy:
@@ -57,6 +58,5 @@ def _map_side_by_side(jobs: Sequence[MappingJob], at_once: int, cores: int, prog
             progress(sum(done[:]) / len(jobs), f"{len(ready)} of {len(jobs)} robots mapped")
             if any(result.exception() for result in ready):
                 break
+        pool.shutdown(wait=False, cancel_futures=True)
         return [result.result() for result in results if result.done()]
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)  # they need half a second to end, which nobody has to wait for
