@@ -21,6 +21,7 @@ from mrtm.result import EdgeFate, Event
 from mrtm.robot.poses import pose_of
 from mrtm.robot.robot import Robot
 from mrtm.robot.topology import Vertex
+from mrtm.team.codec import pack, unpack
 from mrtm.team.records import AnchorRecord, EdgeRecord, MapRecord, Record, VertexRecord
 from mrtm.timing import Stages
 
@@ -34,7 +35,7 @@ class MemberRun:
 
     Attributes:
         robot: name.
-        records: what it can tell the others, in the order of their team times.
+        told: what it can tell the others: team time, ascending, and the record, packed.
         times: (n,) of its scans, the log's own clock.
         vertices: (n,) index of the vertex in whose map each scan lies.
         poses: (n, 3) local_T_robot in that vertex.
@@ -46,7 +47,7 @@ class MemberRun:
     """
 
     robot: str
-    records: list[Record]
+    told: list[tuple[float, bytes]]
     times: FloatArray
     vertices: npt.NDArray[np.int64]
     poses: FloatArray
@@ -56,6 +57,11 @@ class MemberRun:
     seconds: dict[str, float]
     longest: dict[str, float]
     blemishes: list[str] = field(default_factory=list)
+
+    @property
+    def records(self) -> list[Record]:
+        """What was told, as others will see it."""
+        return [unpack(data) for _, data in self.told]
 
 
 def map_member(
@@ -73,7 +79,7 @@ def map_member(
         report: told now and then how many scans have been taken and how many vertices there are.
     """
     stages = Stages()
-    story = _Story(name, moments)
+    story = _Story(name, moments, stages)
     robot = Robot(name, config, story.make_joint, story.events.append, story.visited, stages)
     source = iter(scans)
     while True:
@@ -105,11 +111,12 @@ class _Anchor:
 class _Story:
     """Listens to a robot at work and writes down what it could tell the others, and when."""
 
-    def __init__(self, robot: str, moments: Sequence[float]) -> None:
-        self.records: list[Record] = []
+    def __init__(self, robot: str, moments: Sequence[float], stages: Stages) -> None:
+        self.told: list[tuple[float, bytes]] = []
         self.events: list[Event] = []
         self.times: list[float] = []  # team times of the scans
         self._robot = robot
+        self._stages = stages
         self._odometry: list[FloatArray] = []
         self._moments = list(enumerate(moments))
         self._anchors: list[_Anchor] = []
@@ -120,6 +127,11 @@ class _Story:
     def now(self) -> float:
         """Team time; it never steps back."""
         return self.times[-1]
+
+    def tell(self, record: Record) -> None:
+        """Packed at once: a map takes a hundredth of its room then."""
+        with self._stages("exchange"):
+            self.told.append((record.time, pack(record)))
 
     def make_joint(self, root: VertexId) -> "_ToldGraph":
         """M1."""
@@ -143,7 +155,7 @@ class _Story:
         """The robot has taken the scan; tell of vertices and anchors that are new."""
         while self._vertices < len(robot.topology.vertices):
             vertex = robot.topology.vertices[self._vertices].id
-            self.records.append(VertexRecord(vertex, 0, self.now, 0))
+            self.tell(VertexRecord(vertex, 0, self.now, 0))
             self._vertices += 1
         for anchor in self._anchors[::-1]:
             if anchor.version >= 0:
@@ -161,8 +173,8 @@ class _Story:
         """A map has been closed: its scans' poses are what they will stay."""
         version = self._versions[vertex.id] = self._versions.get(vertex.id, 0) + 1
         local_map = local_map_of(vertex, np.array(self.times))
-        self.records.append(VertexRecord(vertex.id, version, self.now, len(local_map.scans)))
-        self.records.append(MapRecord(vertex.id, version, self.now, local_map.grid, local_map.cloud, local_map.normals))
+        self.tell(VertexRecord(vertex.id, version, self.now, len(local_map.scans)))
+        self.tell(MapRecord(vertex.id, version, self.now, local_map.grid, local_map.cloud, local_map.normals))
         for anchor in self._anchors:
             if first <= anchor.scan < first + len(visit.poses):
                 anchor.version = max(anchor.version, 0)  # what comes is refined, even if nothing was told before
@@ -173,7 +185,7 @@ class _Story:
     def _tell_anchor(self, anchor: _Anchor, vertex: VertexId, at_scan: UncertainPose) -> None:
         anchor.version += 1
         pose = UncertainPose(at_scan.pose.compose(pose_of(anchor.offset)), at_scan.covariance + EXACT)
-        self.records.append(AnchorRecord(self._robot, anchor.number, anchor.version, self.now, vertex, pose))
+        self.tell(AnchorRecord(self._robot, anchor.number, anchor.version, self.now, vertex, pose))
 
 
 class _ToldGraph:
@@ -187,7 +199,8 @@ class _ToldGraph:
         """See ``JointGraph``."""
         add, replace = list(add), list(replace)
         self._graph.update(add=add, replace=replace)
-        self._story.records.extend(EdgeRecord(edge, self._story.now) for edge in (*add, *replace))
+        for edge in (*add, *replace):
+            self._story.tell(EdgeRecord(edge, self._story.now))
 
     def relative(self, a: VertexId, b: VertexId) -> UncertainPose:
         """See ``JointGraph``."""
@@ -204,7 +217,7 @@ def _run(robot: Robot, story: _Story, stages: Stages) -> MemberRun:
         inside[scans] = vertex.id.index
     return MemberRun(
         robot=robot.name,
-        records=story.records,
+        told=story.told,
         times=times,
         vertices=inside,
         poses=poses,

@@ -16,7 +16,7 @@ from mrtm.robot.poses import array_of
 from mrtm.team.codec import pack
 from mrtm.team.exchange import exchange
 from mrtm.team.member import MemberRun
-from mrtm.team.records import Record, SightingRecord
+from mrtm.team.records import SightingRecord
 from mrtm.team.sightings_file import TimedSighting, sighting_times
 from mrtm.team.store import item_of
 from mrtm.team.teammate import Peers, Teammate
@@ -68,20 +68,15 @@ class Playback:
     def play(self, report: Callable[[float], None]) -> None:
         """All meetings, and what the listener makes of it all in the end."""
         meetings = _meetings(self._sightings, self._config.team.exchange_interval)
-        told = deque[tuple[float, Record]](
-            heapq.merge(
-                *([(r.time, r) for r in run.records] for run in self._runs),
-                [(s.time, s) for s in self._sightings],
-                key=lambda item: item[0],
-            )
-        )
+        seen = [(s.time, pack(s)) for s in self._sightings]
+        told = deque(heapq.merge(*(run.told for run in self._runs), seen, key=lambda item: item[0]))
         for number, (time, robots) in enumerate(meetings):
             while told and told[0][0] <= time:
                 self._write_down(told.popleft()[1])
             self._meet(time, robots)
             report(number / len(meetings))
-        for _, record in told:
-            self._write_down(record)
+        for _, data in told:
+            self._write_down(data)
         for teammate in self.team.values():
             teammate.learn()
         self.listener.settle()
@@ -102,11 +97,11 @@ class Playback:
                 return False
         return True
 
-    def _write_down(self, record: Record) -> None:
+    def _write_down(self, data: bytes) -> None:
         with self._stages("exchange"):
-            packed = item_of(pack(record))
-            for teammate in (self.team[record.key.robot], self.listener):
-                teammate.store.add(packed)
+            item = item_of(data)
+            for teammate in (self.team[item.key.robot], self.listener):
+                teammate.store.add(item)
 
     def _meet(self, time: float, robots: tuple[str, str]) -> None:
         """M10 and M11."""

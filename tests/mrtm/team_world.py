@@ -10,6 +10,7 @@ from factors.sighting import Sighting
 from frontend.local_map import Grid, LocalMap
 from mrtm.config import Config, load_config
 from mrtm.joint.hypotheses import Hypothesis
+from mrtm.team.codec import pack
 from mrtm.team.member import MemberRun
 from mrtm.team.records import AnchorRecord, EdgeRecord, Record, SightingRecord, VertexRecord
 from mrtm.team.session_file import TimedSighting
@@ -128,7 +129,12 @@ def run_of(
         grid = Grid(np.zeros((2, 2), np.float32), 0.05, np.zeros(2))
         none = np.empty((0, 2))
         maps[VertexId(name, index)] = LocalMap(grid, inside, times[inside], np.zeros((len(inside), 3)), none, none)
-    return MemberRun(name, records, times, vertices, np.zeros((len(times), 3)), maps, [], [], {}, {})
+    return MemberRun(name, told(records), times, vertices, np.zeros((len(times), 3)), maps, [], [], {}, {})
+
+
+def told(records: Iterable[Record]) -> list[tuple[float, bytes]]:
+    """As a run holds them."""
+    return [(record.time, pack(record)) for record in records]
 
 
 def timed(moments: Sequence[tuple[float, Hypothesis]]) -> list[TimedSighting]:

@@ -25,7 +25,7 @@ from mrtm.team.records import AnchorRecord, Kind
 from mrtm.team.sightings_file import sighting_times
 from mrtm.team.store import Store
 from tests.mrtm.sighting_world import TeamWorld
-from tests.mrtm.team_world import BETWEEN, NO_MAPS, chain, run_of, timed
+from tests.mrtm.team_world import BETWEEN, NO_MAPS, chain, run_of, timed, told
 from tools.simulation import write_tum
 
 Moments = list[tuple[float, Hypothesis]]
@@ -152,7 +152,8 @@ def test_nothing_is_known_before_it_happens() -> None:
     until = early[-1][0] + LINGER
     made = runs(world, when)
     later = [
-        replace(r, records=[x if x.time <= until else replace(x, time=x.time + 999.0) for x in r.records]) for r in made
+        replace(r, told=told(x if x.time <= until else replace(x, time=x.time + 999.0) for x in r.records))
+        for r in made
     ]
     expected, found = (story(play(some, timed(when), NO_MAPS)).meetings for some in (made, later))
     count = sum(m.time <= until for m in expected)
@@ -255,15 +256,15 @@ def test_a_sighting_of_a_robot_that_does_not_run_is_refused_and_nothing_else_suf
     world = chain(11, 3, sightings=8)
     times = moments(world)
     made = runs(world, times)
-    made[0] = replace(made[0], records=[r for r in made[0].records if r.time >= 10.0 or r.kind is not Kind.VERTEX])
+    made[0] = replace(made[0], told=told(r for r in made[0].records if r.time >= 10.0 or r.kind is not Kind.VERTEX))
     first = timed([(when, h) for _, h in times if h.robots == ("r0", "r1")])[0]
     sightings = [first, *timed(times)]
     sightings.sort(key=lambda s: s.time)
     numbers = {name: {t: n for n, t in enumerate(sighting_times(sightings, name))} for name in world.names}
     for run in made:  # the anchors keep their times, and so have other numbers
-        run.records = [
+        run.told = told(
             replace(r, number=numbers[run.robot][r.time]) if isinstance(r, AnchorRecord) else r for r in run.records
-        ]
+        )
     result = play(made, sightings, NO_MAPS)
     fates = {f.time: f for f in story(result).sightings}
     assert fates[when].fate == "refused"

@@ -46,7 +46,7 @@ def main(
         playback = Playback(runs, part.sightings, config)
         _, play_wall, play_cpu = timed(lambda playback=playback: playback.play(lambda _: None))  # type: ignore[misc]
         records = sum(len(teammate.store) for teammate in playback.team.values()) / count
-        lasted = max(run.records[-1].time for run in runs) - min(run.records[0].time for run in runs)
+        lasted = max(run.told[-1][0] for run in runs) - min(run.told[0][0] for run in runs)
         largest = max(len(component.robots) for component in playback.listener.joint.components())
         typer.echo(
             f"{count:6} {len(part.sightings):9} | {wall:15.1f} {cpu:5.1f} | {play_wall:8.1f} {play_cpu:5.1f} "
