@@ -11,7 +11,6 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 from numba import njit
-from scipy.ndimage import distance_transform_edt
 
 from frontend import se2
 from frontend.local_map import Grid
@@ -103,14 +102,10 @@ class Lookup:
     def of(cls, local_map: SurfaceMap) -> "Lookup":
         """Sort the cells of a local map."""
         grid = local_map.grid
-        known, occupied = np.abs(grid.log_odds) > UNKNOWN, grid.log_odds > 0.0
-        if occupied.any():
-            distance = distance_transform_edt(~occupied, sampling=grid.resolution)
-        else:
-            distance = np.full(grid.log_odds.shape, np.inf)
+        known = np.abs(grid.log_odds) > UNKNOWN
         kinds = np.where(known, _OTHER, _UNKNOWN).astype(np.uint8)
-        kinds[(grid.log_odds <= FREE) & (distance > CLEAR)] = _CLEAR
-        kinds[distance <= NEAR] = _SURFACE
+        kinds[grid.log_odds <= FREE] = _CLEAR
+        _spread(np.argwhere(grid.log_odds > 0.0), CLEAR / grid.resolution, NEAR / grid.resolution, kinds)
         step = -(-len(local_map.cloud) // _MOST_POINTS) or 1
         rows, columns = np.nonzero(known[::_AREA_STEP, ::_AREA_STEP])
         area = grid.origin + grid.resolution * (_AREA_STEP * np.column_stack([columns, rows]) + 0.5)
@@ -120,20 +115,25 @@ class Lookup:
 
 def agreement(a: Lookup, b: Lookup, a_T_b: FloatArray) -> Agreement:
     """Compare two maps at one relative pose (3,), both ways."""
-    points, hits, conflicts = _counts(a, b, a_T_b[None])[0]
+    points, hits, conflicts = counts(a, b, a_T_b[None])[0]
     total = max(int(points), 1)
     return Agreement(overlap(a, b, a_T_b), int(hits) / total, int(conflicts) / total, int(points))
 
 
 def overlap(a: Lookup, b: Lookup, a_T_b: FloatArray) -> float:
     """Area known in both, m^2."""
-    return int(np.count_nonzero(known(a, b.area, a_T_b))) * (_AREA_STEP * b.resolution) ** 2
+    cells: int = _known(a.kinds, a.resolution, a.origin, b.area, a_T_b)
+    return cells * (_AREA_STEP * b.resolution) ** 2
 
 
-def scores(a: Lookup, b: Lookup, poses: FloatArray, least: int = LEAST_POINTS) -> FloatArray:
-    """(k,) hits less conflicts, -1 to 1, at relative poses (k, 3); -1 where fewer than ``least`` points are known."""
-    counts = _counts(a, b, poses)
-    return np.where(counts[:, 0] >= least, (counts[:, 1] - counts[:, 2]) / np.maximum(counts[:, 0], 1), -1.0)
+def scores(a: Lookup, b: Lookup, poses: FloatArray, least: int = LEAST_POINTS, thinned: int = 1) -> FloatArray:
+    """(k,) hits less conflicts, -1 to 1, at relative poses (k, 3); -1 where fewer than ``least`` points are known.
+
+    Of the points one in ``thinned`` is looked up, and stands for so many.
+    """
+    found = counts(a, b, poses, thinned)
+    enough = thinned * found[:, 0] >= least
+    return np.where(enough, (found[:, 1] - found[:, 2]) / np.maximum(found[:, 0], 1), -1.0)
 
 
 def known(a: Lookup, points: FloatArray, pose: FloatArray) -> npt.NDArray[np.bool_]:
@@ -146,12 +146,13 @@ def known(a: Lookup, points: FloatArray, pose: FloatArray) -> npt.NDArray[np.boo
     return np.asarray(inside)
 
 
-def _counts(a: Lookup, b: Lookup, poses: FloatArray) -> npt.NDArray[np.int64]:
-    """(k, 3) points that fall into known space, on surfaces, into clear space, of both maps, at a_T_b (k, 3)."""
-    counts = np.zeros((len(poses), 3), np.int64)
-    _count(a.kinds, a.resolution, a.origin, b.points, poses, counts)
-    _count(b.kinds, b.resolution, b.origin, a.points, np.ascontiguousarray(se2.inverse(poses)), counts)
-    return counts
+def counts(a: Lookup, b: Lookup, poses: FloatArray, thinned: int = 1) -> npt.NDArray[np.int64]:
+    """(k, 3) points, one in ``thinned`` of both maps, that fall into known space, on surfaces, into clear space of the
+    other, at a_T_b (k, 3)."""
+    found = np.zeros((len(poses), 3), np.int64)
+    _count(a.kinds, a.resolution, a.origin, b.points[::thinned], poses, found)
+    _count(b.kinds, b.resolution, b.origin, a.points[::thinned], np.ascontiguousarray(se2.inverse(poses)), found)
+    return found
 
 
 @njit(cache=True)
@@ -168,3 +169,33 @@ def _count(kinds, resolution, origin, points, poses, counts):  # type: ignore[no
                 counts[k, 0] += kind != _UNKNOWN
                 counts[k, 1] += kind == _SURFACE
                 counts[k, 2] += kind == _CLEAR
+
+
+@njit(cache=True)
+def _known(kinds, resolution, origin, points, pose):  # type: ignore[no-untyped-def]
+    """How many of the points lie in known space."""
+    rows, columns = kinds.shape
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x0, y0 = pose[0] - origin[0], pose[1] - origin[1]
+    found = 0
+    for i in range(len(points)):
+        u = math.floor((x0 + c * points[i, 0] - s * points[i, 1]) / resolution)
+        v = math.floor((y0 + s * points[i, 0] + c * points[i, 1]) / resolution)
+        if 0 <= u < columns and 0 <= v < rows:
+            found += kinds[v, u] != _UNKNOWN
+    return found
+
+
+@njit(cache=True)
+def _spread(occupied, clear, near, kinds):  # type: ignore[no-untyped-def]
+    """Around occupied cells nothing is clearly free within ``clear`` cells, and all is surface within ``near``."""
+    rows, columns = kinds.shape
+    side = int(clear + 1e-6)
+    for row, column in occupied:
+        for v in range(max(0, row - side), min(rows, row + side + 1)):
+            for u in range(max(0, column - side), min(columns, column + side + 1)):
+                square = (v - row) ** 2 + (u - column) ** 2
+                if square <= near * near + 1e-6:
+                    kinds[v, u] = _SURFACE
+                elif square <= clear * clear + 1e-6 and kinds[v, u] == _CLEAR:
+                    kinds[v, u] = _OTHER

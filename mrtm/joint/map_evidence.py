@@ -51,7 +51,9 @@ KEPT = 2**14  # answers
 MOST_PAIRS = 3
 """Pairs of local maps that are compared, those that overlap most."""
 
-_STEPS = ((0.1, 0.02), (0.05, 0.01))  # metres and radians, coarse and fine
+_THINNED = 4  # one point in so many gives a score to about
+_ROUGHLY = 0.1
+_STEPS = ((0.1, 0.02, _THINNED), (0.05, 0.01, 1))  # metres, radians and one point in how many, coarse and fine
 _RASTER = np.array([0.1, 0.1, 0.02])  # metres and radians
 _FINE = np.array([0.1, 0.1, 0.02])
 _SHIFTS = np.arange(0.6, 4.01, 0.2)
@@ -84,10 +86,10 @@ class Fit:
 def fit(a: Lookup, b: Lookup, guess: FloatArray, half: FloatArray) -> Fit:
     """The best pose a_T_b (3,) within ``half`` (3,), metres and radians, of ``guess``."""
     pose = guess
-    for (step, turn), width in zip(_STEPS, (half, _FINE), strict=True):
+    for (step, turn, thinned), width in zip(_STEPS, (half, _FINE), strict=True):
         tried = se2.compose(pose, _around(width, step, turn))
-        score = scores(a, b, tried)
-        if score.max() > scores(a, b, pose[None])[0]:
+        score = scores(a, b, tried, thinned=thinned)
+        if score.max() > scores(a, b, pose[None], thinned=thinned)[0]:
             pose = tried[int(np.argmax(score))]
     axis = _weak_direction(a, b, pose)
     way = np.concatenate([_SHIFTS, -_SHIFTS])
@@ -97,8 +99,14 @@ def fit(a: Lookup, b: Lookup, guess: FloatArray, half: FloatArray) -> Fit:
         moved.append(se2.compose((pose + shift)[:, None], _around(_FINE, 0.1, 0.02)[None]).reshape(-1, 3))
     here = agreement(a, b, pose)
     # Moved sideways two corridors touch wall to wall, which is no overlap: that leaves few of the points.
-    elsewhere = scores(a, b, np.concatenate(moved), max(LEAST_POINTS, here.points // 2)).max()
+    elsewhere = _best_score(a, b, np.concatenate(moved), max(LEAST_POINTS, here.points // 2))
     return Fit(pose, here, float(scores(a, b, pose[None])[0] - elsewhere))
+
+
+def _best_score(a: Lookup, b: Lookup, poses: FloatArray, least: int) -> float:
+    """The best score at any of the poses (k, 3); all points are looked up only where some of them promise it."""
+    rough = scores(a, b, poses, least, _THINNED)
+    return float(scores(a, b, poses[rough >= rough.max() - _ROUGHLY], least).max())
 
 
 class MapEvidence:
@@ -115,14 +123,21 @@ class MapEvidence:
     def __call__(self, tail: VertexId, head: VertexId, tail_T_head: UncertainPose) -> Decision:
         """What the maps of two robots say if ``head`` lies there: one contradiction outweighs any agreement."""
         overlaps = []
-        for u, u_T_tail in self._around(tail):
-            for v, v_T_head in self._around(head):
-                seen = compose(compose(u_T_tail, tail_T_head), inverse(v_T_head))
-                sigma = np.sqrt(np.diag(seen.covariance))
-                if max(sigma[0], sigma[1]) < WIDEST[0] / SIGMAS and sigma[2] < WIDEST[1] / SIGMAS:
-                    pose = np.array(coordinates(seen.pose))
-                    question = _question(pose, sigma)
-                    overlaps.append((_overlap(self._maps[u], self._maps[v], question), u, v, question))
+        heads = self._seen_from(head)
+        if not heads:
+            return Decision.UNDECIDED
+        poses = np.array([coordinates(head_T_v.pose) for _, head_T_v in heads])
+        carry = np.array([head_T_v.pose.inverse().AdjointMap() for _, head_T_v in heads])
+        covariances = np.array([head_T_v.covariance for _, head_T_v in heads])
+        for u, tail_T_u in self._seen_from(tail):
+            u_T_head = compose(inverse(tail_T_u), tail_T_head)
+            seen = se2.compose(np.array(coordinates(u_T_head.pose)), poses)
+            spread = carry @ u_T_head.covariance @ carry.transpose(0, 2, 1) + covariances
+            sigma = np.sqrt(spread.diagonal(axis1=1, axis2=2))
+            sure = (sigma[:, :2].max(axis=1) < WIDEST[0] / SIGMAS) & (sigma[:, 2] < WIDEST[1] / SIGMAS)
+            for place in np.flatnonzero(sure):
+                v, question = heads[place][0], _question(seen[place], sigma[place])
+                overlaps.append((_overlap(self._maps[u], self._maps[v], question), u, v, question))
         overlaps.sort(key=lambda o: (-o[0], o[1], o[2]))
         said = {
             _decision(self._maps[u], self._maps[v], question)
@@ -131,11 +146,11 @@ class MapEvidence:
         }
         return next((word for word in (Decision.CONTRADICTS, Decision.AGREES) if word in said), Decision.UNDECIDED)
 
-    def _around(self, vertex: VertexId) -> list[tuple[VertexId, UncertainPose]]:
-        """The vertices of a robot that have a map, and where ``vertex`` lies in each."""
-        graph, nowhere = self._graphs[vertex.robot], UncertainPose(gtsam.Pose2(), np.zeros((3, 3)))
+    def _seen_from(self, vertex: VertexId) -> list[tuple[VertexId, UncertainPose]]:
+        """The vertices of a robot that have a map, and where each lies, seen from one of the robot's vertices."""
+        graph, here = self._graphs[vertex.robot], UncertainPose(gtsam.Pose2(), np.zeros((3, 3)))
         owned = sorted(v for v in self._maps if v.robot == vertex.robot)
-        return [(v, nowhere if v == vertex else graph.relative(v, vertex)) for v in owned]
+        return [(v, here if v == vertex else graph.relative(vertex, v)) for v in owned]
 
 
 class _Question(NamedTuple):
