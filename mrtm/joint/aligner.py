@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
+from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId, inverse
 from mrtm.joint.alignment import Alignment, align
 from mrtm.joint.candidates import Candidate, pairs
 from mrtm.joint.graph import JointGraph
@@ -23,11 +23,6 @@ MOVED = 4.0
 
 CONTRADICTED = 30.0
 """chi2 of 3 degrees of freedom, as for loops: an alignment so far from the joint estimate is taken back."""
-
-NEAR = 0.25
-"""Squared Mahalanobis distance between two guesses up to which they are one question."""
-
-KEPT = 8  # answers about two maps
 
 SCREENED = 2
 """Pairs whose overlap is worked out, for each that is tried at most."""
@@ -58,40 +53,10 @@ class Attempt:
     refusal: str
 
 
-class Alignments:
-    """What came of aligning maps, for several aligners that ask about the same ones."""
+class Aligner:
+    """The alignments of one joint map."""
 
     def __init__(self) -> None:
-        self._found: dict[tuple[Surface, Surface], list[tuple[UncertainPose, Alignment | None]]] = {}
-
-    def __call__(self, a: Surface, b: Surface, guess: UncertainPose) -> Alignment | None:
-        """See ``align``; the answer to next to the same question is the same."""
-        before = self._found.setdefault((a, b), [])
-        for asked, found in before:
-            if _same_question(asked, guess):
-                return found
-        found = align(a, b, guess)
-        before.append((guess, found))
-        del before[:-KEPT]
-        return found
-
-
-def _same_question(one: UncertainPose, other: UncertainPose) -> bool:
-    offset = gtsam.Pose2.Logmap(one.pose.between(other.pose))
-    near = float(offset @ np.linalg.solve(one.covariance, offset)) < NEAR
-    volumes = np.linalg.det(one.covariance) / np.linalg.det(other.covariance)
-    return near and 1.0 / SURER < volumes < SURER
-
-
-class Aligner:
-    """The alignments of one joint map.
-
-    Args:
-        alignments: shared with others; own ones by default.
-    """
-
-    def __init__(self, alignments: Alignments | None = None) -> None:
-        self._align = Alignments() if alignments is None else alignments
         self.attempts: dict[Pair, Attempt] = {}
         self._versions: dict[Pair, int] = {}
 
@@ -128,7 +93,8 @@ class Aligner:
         asked: dict[Pair, UncertainPose] = {}
 
         def relative(a: VertexId, b: VertexId) -> UncertainPose:
-            guess = asked[a, b] = graph.relative(a, b)
+            guess = graph.relative(a, b)
+            asked[min(a, b), max(a, b)] = guess if a < b else inverse(guess)
             return guess
 
         near = pairs(closed, poses, relative, wanted, most=looks, looks=looks)
@@ -177,7 +143,7 @@ class Aligner:
         )
 
     def _try(self, pair: Pair, maps: tuple[Surface, Surface], guess: UncertainPose) -> None:
-        found = self._align(*maps, guess)
+        found = align(*maps, guess)
         edge, refusal = None, "nothing of the maps can meet"
         if found is not None:
             refusal = found.refusal or ""

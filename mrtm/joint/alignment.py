@@ -1,5 +1,6 @@
 """Alignment of two overlapping local maps (M13, on line): where one lies on the other, how sure, and whether at all."""
 
+import math
 from dataclasses import dataclass
 
 import gtsam
@@ -8,10 +9,10 @@ import numpy as np
 from factors import UncertainPose
 from factors.noise import FloatArray
 from frontend import se2
-from mrtm.joint.agreement import Agreement, agreement, scores
-from mrtm.joint.correlative import hypotheses
+from mrtm.joint.agreement import Agreement, agreement, counts, scores
+from mrtm.joint.correlative import SIGMAS, hypotheses
 from mrtm.joint.fit import Fit, fit
-from mrtm.joint.icp import icp
+from mrtm.joint.icp import COARSE, FINE, icp
 from mrtm.joint.surface import Surface
 from mrtm.robot.poses import array_of, innovation, pose_of
 
@@ -62,8 +63,9 @@ class Alignment:
 def align(a: Surface, b: Surface, guess: UncertainPose) -> Alignment | None:
     """Lay ``b`` on ``a``.
 
-    Every pose within three standard deviations of the guess is looked at (correlative search), the best of them are
-    refined (ICP, point to line), and the one that brings most surfaces together is judged.
+    Where three standard deviations of the guess are within the basin of ICP (point to line), it starts from there.
+    Where they are not, every pose among them is looked at (correlative search), and it starts from the best of these.
+    The place that brings most surfaces together is refined with more points, and judged.
 
     Args:
         a, b: two local maps, prepared.
@@ -72,29 +74,45 @@ def align(a: Surface, b: Surface, guess: UncertainPose) -> Alignment | None:
     Returns:
         The alignment, accepted or not; None where nothing of the maps can meet.
     """
-    start = array_of(guess.pose)
-    refined = [icp(a, b, pose) for pose in hypotheses(a, b, start, np.asarray(guess.covariance))]
-    places = [(pose, agreement(a.lookup, b.lookup, pose)) for pose in refined if pose is not None]
-    if not places:
+    places = _places(a, b, guess)
+    if len(places) == 0:
         return None
-    best, there = max(places, key=lambda place: place[1].points * _score(place[1]))
+    counted = counts(a.lookup, b.lookup, places)
+    score = (counted[:, 1] - counted[:, 2]) / np.maximum(counted[:, 0], 1)
+    first = int(np.argmax(counted[:, 1] - counted[:, 2]))
+    best = icp(a, b, places[first], (FINE,))
+    if best is None:
+        return None
     found = fit(a, b, best)
-    estimate = _estimate(guess, best, _seen(a, b, best, found, _score(there)), found.drift)
-    information = np.linalg.inv(estimate.covariance)
-    rival = 0.0
-    for pose, other in places:
-        offset = se2.log(se2.between(best, pose))
-        if offset @ information @ offset > DISTINCT and other.points >= RIVAL_POINTS * there.points:
-            rival = max(rival, _score(other) / max(_score(there), 0.01))
+    estimate = _estimate(guess, best, _seen(a, b, best, found, float(score[first])), found.drift)
+    offsets = se2.log(se2.between(best, places))
+    others = np.einsum("ki,ij,kj->k", offsets, np.linalg.inv(estimate.covariance), offsets) > DISTINCT
+    others &= counted[:, 0] >= RIVAL_POINTS * counted[first, 0]
+    rival = float(score[others].max(initial=0.0)) / max(float(score[first]), 0.01)
     agreed = agreement(a.lookup, b.lookup, array_of(estimate.pose))
     _, moved = innovation(guess, estimate)
     refusal = _refusal(found, agreed, rival, moved)
     return Alignment(estimate, found.pairs, found.residual, agreed, rival, moved, refusal)
 
 
-def _score(agreed: Agreement) -> float:
-    """Share of the surface points that agree less that of those that do not."""
-    return agreed.hits - agreed.conflicts
+def _places(a: Surface, b: Surface, guess: UncertainPose) -> FloatArray:
+    """(k, 3) poses at which surfaces of ``b`` lie on surfaces of ``a``, that the guess allows; k may be 0."""
+    start = array_of(guess.pose)
+    off = SIGMAS * _offset(b, guess.covariance)
+    if off > COARSE[0].reach:
+        starts = hypotheses(a, b, start, np.asarray(guess.covariance))
+        found = [icp(a, b, pose, COARSE) for pose in starts]
+    else:
+        found = [icp(a, b, start, [r for r in COARSE if r.reach <= 2.0 * max(off, COARSE[-1].reach)])]
+    return np.array([pose for pose in found if pose is not None]).reshape(-1, 3)
+
+
+def _offset(b: Surface, covariance: FloatArray) -> float:
+    """Standard deviation of where the guess has the points of ``b``, metres: their root mean square."""
+    x, y = b.points.mean(axis=0) if len(b.points) else (0.0, 0.0)
+    square = float(np.square(b.points).sum()) / max(1, len(b.points))
+    turned = square * covariance[2, 2] + 2.0 * (x * covariance[1, 2] - y * covariance[0, 2])
+    return math.sqrt(covariance[0, 0] + covariance[1, 1] + turned)
 
 
 def _seen(a: Surface, b: Surface, best: FloatArray, found: Fit, score: float) -> FloatArray:

@@ -1,5 +1,6 @@
 """Which closed maps are worth aligning after an event: those that are likely to overlap, not all pairs of all."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from itertools import islice
@@ -8,7 +9,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from factors import UncertainPose, VertexId
+from factors import UncertainPose, VertexId, inverse
 from frontend import se2
 from frontend.records import FloatArray
 from mrtm.joint.agreement import overlap
@@ -41,7 +42,8 @@ def pairs(
     Args:
         maps: of closed vertices of one component.
         poses: joint_T_local of at least these.
-        relative: a_T_b and its covariance in the frame of b, such as ``JointGraph.relative``; asked of near pairs only.
+        relative: a_T_b and its covariance in the frame of b, such as ``JointGraph.relative``; asked of near pairs only,
+            in either order.
         wanted: whether a pair, a before b, is worth a look at all. All by default.
         most: pairs at most.
         looks: pairs that are asked about, those of the nearest maps; all by default.
@@ -55,10 +57,13 @@ def pairs(
     i, k = np.nonzero(np.triu(apart <= MAX_XY, 1))
     found: list[tuple[float, Candidate]] = []
     nearest = ((int(i[place]), int(k[place])) for place in np.argsort(apart[i, k], kind="stable"))
-    asked = islice(((a, b) for a, b in nearest if wanted(vertices[a], vertices[b])), looks)
-    for row, column in sorted(asked):  # one ``a`` after the other: the first question about it takes long
+    asked = list(islice(((a, b) for a, b in nearest if wanted(vertices[a], vertices[b])), looks))
+    often = Counter(end for pair in asked for end in pair)
+    # From the end that is in more pairs: the first question from a vertex takes long.
+    start = {pair: max(pair, key=often.__getitem__) for pair in asked}
+    for row, column in sorted(asked, key=lambda pair: (start[pair], pair)):
         a, b, distance = vertices[row], vertices[column], apart[row, column]
-        guess = relative(a, b)
+        guess = relative(a, b) if start[row, column] == row else inverse(relative(b, a))
         if distance > 3.0 * np.sqrt(np.linalg.eigvalsh(guess.covariance[:2, :2])[1]):
             continue
         area = _likely_overlap(maps[a], maps[b], guess)

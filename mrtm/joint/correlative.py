@@ -23,9 +23,6 @@ PEAKS = 10
 WORTH = 0.3  # of the best score: lower peaks are not worth refining
 PRIOR_WEIGHT = 0.01  # of the best score, for each unit of chi2 against the guess: decides between equals only
 
-# The share of a point that lies so many cells away: full within a cell, half within two.
-_NEAR = [(i, j, 2 if i * i + j * j <= 2 else 1) for i in range(-2, 3) for j in range(-2, 3) if i * i + j * j <= 5]
-
 
 def hypotheses(a: Surface, b: Surface, guess: FloatArray, covariance: FloatArray) -> FloatArray:
     """Poses that bring surfaces of ``b`` onto surfaces of ``a`` that face alike, best first.
@@ -81,14 +78,24 @@ def _field(a: Surface) -> tuple[npt.NDArray[np.uint8], FloatArray]:
     origin = a.points.min(axis=0) - margin
     width, height = np.ceil((a.points.max(axis=0) + margin - origin) / CELL).astype(int)
     field = np.zeros((DIRECTIONS, height, width), np.uint8)
-    u, v = np.floor((a.points - origin) / CELL).astype(int).T
-    facing = np.floor(np.arctan2(a.normals[:, 1], a.normals[:, 0]) * DIRECTIONS / (2.0 * np.pi)).astype(int)
-    for near in (1, 2):  # the nearer later, to stand
-        for i, j, share in _NEAR:
-            if share == near:
-                for turn in (-1, 0, 1):
-                    field[(facing + turn) % DIRECTIONS, v + i, u + j] = share
+    facing = np.floor(np.arctan2(a.normals[:, 1], a.normals[:, 0]) * DIRECTIONS / (2.0 * np.pi)).astype(np.int64)
+    _draw(np.floor((a.points - origin) / CELL).astype(np.int64), facing, field)
     return field, origin
+
+
+@numba.njit(cache=True, nogil=True)
+def _draw(cells, facing, field):  # type: ignore[no-untyped-def]
+    """Each point's share of the cells around it: full within a cell, half within two."""
+    directions = len(field)
+    for k in range(len(cells)):
+        for i in range(-2, 3):
+            for j in range(-2, 3):
+                square = i * i + j * j
+                if square <= 5:
+                    share = 2 if square <= 2 else 1
+                    for turn in range(-1, 2):
+                        layer = field[(facing[k] + turn) % directions]
+                        layer[cells[k, 1] + i, cells[k, 0] + j] = max(layer[cells[k, 1] + i, cells[k, 0] + j], share)
 
 
 @numba.njit(cache=True, nogil=True)

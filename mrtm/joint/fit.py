@@ -78,9 +78,9 @@ def fit(a: Surface, b: Surface, a_T_b: FloatArray) -> Fit:
 
 def _patches(points: FloatArray, normals: FloatArray) -> npt.NDArray[np.int64]:
     """The patch (n,) each point belongs to: a square of the plane and one of eight directions."""
-    direction = np.round(np.arctan2(normals[:, 1], normals[:, 0]) * 4.0 / np.pi) % 8.0
-    keys = np.column_stack([np.floor(points / PATCH), direction])
-    return np.asarray(np.unique(keys, axis=0, return_inverse=True)[1]).ravel()
+    direction = np.round(np.arctan2(normals[:, 1], normals[:, 0]) * 4.0 / np.pi).astype(np.int64) % 8
+    column, row = np.floor((points - points.min(axis=0)) / PATCH).astype(np.int64).T
+    return np.asarray(np.unique((row * (column.max() + 1) + column) * 8 + direction, return_inverse=True)[1])
 
 
 def _weights(residuals: FloatArray, patch: npt.NDArray[np.int64]) -> FloatArray:

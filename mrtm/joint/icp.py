@@ -1,106 +1,100 @@
-"""Iterative closest points between the surfaces of two local maps, by Open3D."""
+"""Iterative closest points between the surfaces of two local maps, point to line (Chen and Medioni 1991)."""
 
-import ctypes
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import cache
-from typing import Any
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
 
+import numba
 import numpy as np
 
+from frontend import se2
 from frontend.records import FloatArray
-from mrtm.errors import MrtmError
-from mrtm.joint.surface import Surface, partners, rotation
+from mrtm.joint.buckets import nearest
+from mrtm.joint.surface import FACING, Surface
 
-ROUNDS = ((0.5, 0.05, 500), (0.3, 0.05, 500), (0.15, 0.03, 4000))
-"""Reach of a correspondence and scale of the robust kernel, metres, and about how many points are moved. The last
-reach and scale are what noise and the cells explain."""
 
+class Round(NamedTuple):
+    """How partners are sought: within ``reach``, metres, for about ``points`` of the points that are moved."""
+
+    reach: float
+    points: int
+
+
+COARSE = Round(0.5, 500), Round(0.3, 500), Round(0.15, 500)
+FINE = Round(0.15, 1500)
+SCALE = 0.17  # metres, of the robust kernel (Geman and McClure)
 ITERATIONS = 15  # a round
+STILL = 1e-4  # metres and radians a step: the end of a round
+DAMPING = 1e-4  # of the points' weight: where nothing fixes a direction, nothing moves along it
 LEAST = 30  # pairs of points below which there is nothing to align
+FARTHEST = 1.0  # metres from the guess
 
 
-@contextmanager
-def _one_cpu() -> Iterator[None]:
-    """What counts the processors within, as Open3D's TBB does when it first works, finds one (on Linux).
-
-    Threads add up in any order, and along a corridor, where nothing but the last digits says where to stop, that moved
-    the result by up to a metre from run to run. For so few points one thread is also the fastest.
-    """
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(allowed)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, allowed)
-
-
-@cache
-def _open3d() -> Any:
-    """Open3D, loaded late: it takes half a second. Its wheel needs libusb (for cameras), which another wheel brings."""
-    try:
-        import libusb_package
-
-        ctypes.CDLL(str(libusb_package.get_library_path()), ctypes.RTLD_GLOBAL)
-        with _one_cpu():
-            import open3d
-
-            one = _cloud(open3d, np.zeros((1, 2)), np.array([[1.0, 0.0]]))
-            open3d.pipelines.registration.registration_icp(one, one, 1.0)  # only now its threads are counted
-    except (ImportError, OSError) as error:
-        raise MrtmError(f"Open3D cannot be loaded ({error}); on a bare Linux: apt install libgl1 libx11-6") from error
-    return open3d
-
-
-def icp(a: Surface, b: Surface, guess: FloatArray) -> FloatArray | None:
-    """Move ``b`` onto ``a``, point to line (Chen and Medioni 1991), from a guess within half a metre and 0.2 rad.
-
-    Before each round, points that have no partner facing alike are left out: Open3D does not ask which way points
-    face. The normals are ours, in the plane: Open3D's own of a flat cloud point out of it, and align nothing.
+def icp(a: Surface, b: Surface, guess: FloatArray, rounds: Iterable[Round]) -> FloatArray | None:
+    """Move ``b`` onto ``a`` from a guess within half a metre and 0.2 rad; only points that face alike attract.
 
     Args:
         guess: (3,) a_T_b.
 
     Returns:
         (3,) a_T_b, or None where the surfaces have too little in common.
-
-    Raises:
-        MrtmError: Open3D cannot be loaded.
     """
-    open3d = _open3d()
-    registration = open3d.pipelines.registration
-    pose = guess
-    for reach, scale, most in ROUNDS:
-        in_a, in_b = partners(a, b, pose, reach, most)
-        if len(in_b) < LEAST:
+    pose = np.array(guess, np.float64)
+    for reach, most in rounds:
+        step = -(-len(b.points) // most) or 1
+        count = _round(a.points, a.normals, a.buckets.low, a.buckets.starts, b.points[::step], b.normals[::step],
+                       reach, pose)  # fmt: skip
+        if count < LEAST or np.hypot(*(pose[:2] - guess[:2])) > FARTHEST:
             return None
-        in_a = np.unique(in_a)
-        transform = np.eye(4)
-        transform[:2, :2], transform[:2, 3] = rotation(pose[2]), pose[:2]
-        result = registration.registration_icp(
-            _cloud(open3d, b.points[in_b], b.normals[in_b]),
-            _cloud(open3d, a.points[in_a], a.normals[in_a]),
-            reach,
-            transform,
-            registration.TransformationEstimationPointToPlane(registration.GMLoss(scale)),
-            registration.ICPConvergenceCriteria(1e-7, 1e-7, ITERATIONS),
-        )
-        t = result.transformation
-        # Where Open3D's threads are several they sum up in any order: the last digits must not come through.
-        pose = np.round([t[0, 3], t[1, 3], np.arctan2(t[1, 0], t[0, 0])], 6)
-        # Where nothing fixes a direction its equations are near singular and a step can go anywhere.
-        if not np.isfinite(pose).all() or np.hypot(*(pose[:2] - guess[:2])) > 2.0 * ROUNDS[0][0]:
-            return None
+    pose[2] = se2.wrap(pose[2])
     return pose
 
 
-def _cloud(open3d: Any, points: FloatArray, normals: FloatArray) -> Any:
-    flat = np.zeros(len(points))
-    cloud = open3d.geometry.PointCloud()
-    cloud.points = open3d.utility.Vector3dVector(np.column_stack([points, flat]))
-    cloud.normals = open3d.utility.Vector3dVector(np.column_stack([normals, flat]))
-    return cloud
+@numba.njit(cache=True)
+def _round(a_points, a_normals, low, starts, points, normals, reach, pose):  # type: ignore[no-untyped-def]
+    """Gauss-Newton on the distances to the partners' lines, these sought anew at each step; ``pose`` is moved."""
+    count = 0
+    for _ in range(ITERATIONS):
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        count = 0
+        hxx = hxy = hyy = hxt = hyt = htt = gx = gy = gt = 0.0
+        for j in range(len(points)):
+            # Relative to the origin of b: it turns about that.
+            x, y = c * points[j, 0] - s * points[j, 1], s * points[j, 0] + c * points[j, 1]
+            nx, ny = c * normals[j, 0] - s * normals[j, 1], s * normals[j, 0] + c * normals[j, 1]
+            i = nearest(a_points, a_normals, low, starts, x + pose[0], y + pose[1], nx, ny, reach, FACING)
+            if i < 0:
+                continue
+            count += 1
+            ax, ay = a_normals[i, 0], a_normals[i, 1]
+            off = ax * (x + pose[0] - a_points[i, 0]) + ay * (y + pose[1] - a_points[i, 1])
+            t = ay * x - ax * y
+            w = (1.0 + (off / SCALE) ** 2) ** -2
+            hxx += w * ax * ax
+            hxy += w * ax * ay
+            hyy += w * ay * ay
+            hxt += w * ax * t
+            hyt += w * ay * t
+            htt += w * t * t
+            gx += w * ax * off
+            gy += w * ay * off
+            gt += w * t * off
+        if count < LEAST:
+            break
+        damping = DAMPING * (hxx + hyy)
+        hxx += damping
+        hyy += damping
+        htt += damping
+        # Cramer's rule.
+        mxx, mxy, mxt = hyy * htt - hyt * hyt, hxt * hyt - hxy * htt, hxy * hyt - hyy * hxt
+        myy, myt, mtt = hxx * htt - hxt * hxt, hxy * hxt - hxx * hyt, hxx * hyy - hxy * hxy
+        det = hxx * mxx + hxy * mxy + hxt * mxt
+        dx = -(mxx * gx + mxy * gy + mxt * gt) / det
+        dy = -(mxy * gx + myy * gy + myt * gt) / det
+        dt = -(mxt * gx + myt * gy + mtt * gt) / det
+        pose[0] += dx
+        pose[1] += dy
+        pose[2] += dt
+        if abs(dx) < STILL and abs(dy) < STILL and abs(dt) < STILL:
+            break
+    return count

@@ -2,19 +2,17 @@
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from frontend.records import FloatArray
 from mrtm.joint.agreement import FREE, Lookup, SurfaceMap
+from mrtm.joint.buckets import Buckets, nearest
 
 FACING = 0.7
 """Least cosine between the normals of two points of one surface. Walls are thin: the nearest point of another map is
 often on the back of the wall, in the next room, and would pull the rooms into each other."""
-
-NEIGHBOURS = 4
-"""Nearest points among which one that faces alike is looked for."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -22,17 +20,13 @@ class Surface:
     """A local map made ready for many alignments.
 
     Attributes:
-        points: (n, 2) those of its cloud whose normal is known, metres, local frame.
-        normals: (n, 2) of length one.
-        tree: finds points.
+        buckets: those points of its cloud whose normal is known, local frame.
         scatter: (2, 2) mean outer product of the normals, trace one: how much the walls say in each direction.
         width: metres of free space in front of a wall, on average: about 1 in corridors and small rooms, 4 in a hall.
         lookup: the grid, for comparing.
     """
 
-    points: FloatArray
-    normals: FloatArray
-    tree: cKDTree
+    buckets: Buckets
     scatter: FloatArray
     width: float
     lookup: Lookup
@@ -47,7 +41,17 @@ class Surface:
         grid = local_map.grid
         free = np.count_nonzero(grid.log_odds <= FREE) * grid.resolution
         width = free / max(1, len(local_map.cloud))
-        return cls(points, normals, cKDTree(points), scatter, width, Lookup.of(local_map))
+        return cls(Buckets.of(points, normals), scatter, width, Lookup.of(local_map))
+
+    @property
+    def points(self) -> FloatArray:
+        """(n, 2) metres, local frame."""
+        return self.buckets.points
+
+    @property
+    def normals(self) -> FloatArray:
+        """(n, 2) of length one."""
+        return self.buckets.normals
 
 
 def rotation(theta: float) -> FloatArray:
@@ -57,7 +61,7 @@ def rotation(theta: float) -> FloatArray:
 
 
 def partners(
-    a: Surface, b: Surface, a_T_b: FloatArray, reach: float, most: int | None = None
+    a: Surface, b: Surface, a_T_b: FloatArray, reach: float
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Pairs of points of one surface: for each point of ``b`` the nearest of ``a`` that faces alike, within ``reach``.
 
@@ -65,18 +69,20 @@ def partners(
         a, b: two local maps.
         a_T_b: (3,) where ``b`` lies.
         reach: metres.
-        most: of the points of ``b``, an even choice of about so many; all by default.
 
     Returns:
         (k,) indices into ``a`` and (k,) into ``b``, the latter ascending.
     """
-    if len(a.points) == 0 or len(b.points) == 0:
-        return np.empty(0, np.int64), np.empty(0, np.int64)
-    turned, step = rotation(a_T_b[2]), -(-len(b.points) // most) if most else 1
-    points, normals = b.points[::step], b.normals[::step]
-    _, near = a.tree.query(points @ turned.T + a_T_b[:2], NEIGHBOURS, distance_upper_bound=reach)
-    candidates = np.where(near < len(a.points), near, 0)
-    alike = np.einsum("nki,ni->nk", a.normals[candidates], normals @ turned.T) > FACING
-    alike &= near < len(a.points)
-    mine = np.flatnonzero(alike.any(axis=1))
-    return candidates[mine, alike[mine].argmax(axis=1)].astype(np.int64), mine * step
+    found = np.empty(len(b.points), np.int64)
+    turned = rotation(a_T_b[2])
+    _partners(a.points, a.normals, a.buckets.low, a.buckets.starts,
+              b.points @ turned.T + a_T_b[:2], b.normals @ turned.T, reach, found)  # fmt: skip
+    mine = np.flatnonzero(found >= 0)
+    return found[mine], mine
+
+
+@numba.njit(cache=True)
+def _partners(a_points, a_normals, low, starts, points, normals, reach, found):  # type: ignore[no-untyped-def]
+    for j in range(len(points)):
+        found[j] = nearest(a_points, a_normals, low, starts,
+                           points[j, 0], points[j, 1], normals[j, 0], normals[j, 1], reach, FACING)  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 
 from factors import Edge, EdgeId, GraphEdge, SightingEdge
 from mrtm.config import Config
-from mrtm.joint.aligner import Aligner, Alignments
+from mrtm.joint.aligner import Aligner
 from mrtm.joint.consistency import Judgement, Verdict, judge
 from mrtm.joint.hypotheses import HypothesisId
 from mrtm.joint.joint_map import Component, JointMap
@@ -31,14 +31,12 @@ class Peers:
         concluded: what sightings come to, by the hash of the store.
         settled: what all comes to, likewise.
         answers: of the maps.
-        alignments: of maps.
     """
 
     def __init__(self) -> None:
         self.concluded: dict[bytes, _Conclusion] = {}
         self.settled: dict[bytes, Teammate] = {}
         self.answers: Answers = {}
-        self.alignments = Alignments()
 
 
 GROWN = 1.1  # times as much is known
@@ -73,7 +71,7 @@ class Teammate:
         self.store = Store() if store is None else store
         self.joint = JointMap()
         self.judgements: Mapping[HypothesisId, Judgement] = {}
-        self.aligner = Aligner(peers.alignments)
+        self.aligner = Aligner()
         self._config = config
         self._stages = stages
         self._peers = peers
@@ -139,7 +137,9 @@ class Teammate:
                 tried = [self.aligner.look(c.graph, self._maps, most) for c in self._components()]
             if any(tried):
                 self._enter()
-            if [edge for c in self._components() for edge in self.aligner.take_back(c.graph)]:
+            with self._stages("alignment"):
+                gone = [edge for c in self._components() for edge in self.aligner.take_back(c.graph)]
+            if gone:
                 self._enter()
             if not any(tried):
                 return

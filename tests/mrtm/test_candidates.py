@@ -53,6 +53,20 @@ def test_only_pairs_of_what_changed_and_few_are_asked_about() -> None:
     assert len(world.asked) < 14  # of 39: the rest is too far away whatever the covariance
 
 
+def test_questions_are_asked_from_where_most_of_them_meet() -> None:
+    world = World(12, 1.0, 0.05)
+    found = world.found({11})
+    assert len(found) > 5
+    assert all(b == 11 for _, b in found)
+    assert {a for a, _ in world.asked} == {11}
+    for candidate in pairs(world.maps, world.poses, world.relative, lambda a, b: b.index == 11):
+        expected = world.poses[candidate.a].between(world.poses[candidate.b])
+        assert candidate.guess.pose.equals(expected, 1e-9)
+        variances = np.diag(candidate.guess.covariance)  # turned about the other end, metres away
+        assert variances[1] > world.covariance[1, 1]
+        np.testing.assert_allclose(variances[[0, 2]], np.diag(world.covariance)[[0, 2]])
+
+
 def test_a_bound_keeps_the_best() -> None:
     assert set(World(6, 4.0, 0.05).found(most=3)) < {(i, i + 1) for i in range(5)}
 
