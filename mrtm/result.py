@@ -67,6 +67,24 @@ class Meeting:
 
 
 @dataclass(frozen=True, slots=True)
+class Latency:
+    """How long somebody took from an event to a joint estimate that takes account of it.
+
+    Attributes:
+        time: team time of the event, seconds.
+        robot: who; None for somebody who hears all, at the end.
+        vertices: in the joint map then.
+        seconds: by stage. Exchange counts for both robots; what sightings come to is worked out by the first of those
+            who hold the same records.
+    """
+
+    time: float
+    robot: str | None
+    vertices: int
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
 class SightingFate:
     """What became of a sighting: ``fate`` is "accepted", "waiting" or "refused", and why, with the ``numbers``."""
 
@@ -103,9 +121,10 @@ class TeamStory:
 class RunResult:
     """Everything a run knows at its end, in the joint frame of each component's root.
 
-    ``timings`` are seconds by stage, ``longest`` those of the longest single call, ``counts`` plain numbers (scans,
-    vertices, ...), ``blemishes`` one line each about what the log's reader met. ``components`` lists the vertices of
-    each connected component, root first. ``team`` is None for a robot that was alone.
+    ``timings`` are seconds by stage, ``longest`` those of the longest single call, ``latencies`` those of each event
+    after which a joint map was brought up to date; these three differ from run to run. ``counts`` are plain numbers
+    (scans, vertices, ...), ``blemishes`` one line each about what the log's reader met. ``components`` lists the
+    vertices of each connected component, root first. ``team`` is None for a robot that was alone.
     """
 
     config: dict[str, Any]
@@ -122,3 +141,4 @@ class RunResult:
     counts: dict[str, int]
     blemishes: list[str]
     team: TeamStory | None = None
+    latencies: list[Latency] = field(default_factory=list)

@@ -23,3 +23,8 @@ class Stages:
             spent = time.perf_counter() - started
             self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
             self.longest[stage] = max(self.longest.get(stage, 0.0), spent)
+
+    def since(self, before: dict[str, float]) -> dict[str, float]:
+        """Seconds of each stage since ``seconds`` were as ``before``; stages that have not run are left out."""
+        spent = {stage: seconds - before.get(stage, 0.0) for stage, seconds in self.seconds.items()}
+        return {stage: seconds for stage, seconds in spent.items() if seconds > 0.0}

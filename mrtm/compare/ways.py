@@ -12,7 +12,7 @@ from mrtm.joint.em import optimise
 from mrtm.joint.tree import tree_poses
 from mrtm.moving import moved
 from mrtm.progress import Progress
-from mrtm.result import RunResult
+from mrtm.result import Latency, RunResult
 
 PAPER_EDGES = frozenset(EdgeKind) - {EdgeKind.ALIGNMENT}
 """The kinds of edges that the paper's robots have when M13 begins. Alignments are the on-line form of M13 itself."""
@@ -29,14 +29,19 @@ class Way:
         name: "tree only", "off-line EM" or "on line".
         result: the run, with the vertex poses, trajectories and edges of this way; ``vertex_covariances`` are those of
             the on-line way or none.
-        seconds: of optimisation; on line by every robot for itself and by the one who listens, in the whole run.
-        longest: seconds of the longest single step of it, for which a robot that needs the map has to wait.
+        seconds: of optimisation, once, from all local maps and edges: what one who hears all needs at the end.
+        updates: how often robots brought their joint maps up to date in the whole run.
+        over_run: seconds of optimisation for all of these updates; of the EM estimated, in proportion to the maps that
+            were known at each.
+        longest: seconds of the longest single step, for which a robot that needs the map has to wait.
         available: team time since when there is such a map, in words.
     """
 
     name: str
     result: RunResult
     seconds: float
+    updates: int
+    over_run: float
     longest: float
     available: str
 
@@ -66,17 +71,20 @@ def three_ways(result: RunResult, progress: Progress) -> tuple[Way, Way, Way]:
     # The robots' clock stops for the off-line optimisation: it is one step.
     off_line = f"{em_seconds:.2f} s after the end"
     paper = replace(result, edges=[fate for fate in result.edges if fate.edge.kind in PAPER_EDGES])
+    updates = [latency for latency in result.latencies if latency.robot is not None]
+    shares = sum(latency.vertices for latency in updates) / max(1, sum(map(len, result.components)))
+    on_line = [_optimising(latency) for latency in updates]
+    once = sum(_optimising(latency) for latency in result.latencies if latency.robot is None)
+    n = len(updates)
     return (
-        Way("tree only", moved(paper, tree), tree_seconds, tree_seconds, since),
-        Way("off-line EM", moved(paper, em), em_seconds, em_seconds, off_line),
-        Way(
-            "on line",
-            result,
-            sum(result.timings.get(stage, 0.0) for stage in ON_LINE_STAGES),
-            max(result.longest.get(stage, 0.0) for stage in ON_LINE_STAGES),
-            since,
-        ),
+        Way("tree only", moved(paper, tree), tree_seconds, n, shares * tree_seconds, tree_seconds, since),
+        Way("off-line EM", moved(paper, em), em_seconds, n, shares * em_seconds, em_seconds, off_line),
+        Way("on line", result, once, n, sum(on_line), max(on_line, default=once), since),
     )
+
+
+def _optimising(latency: Latency) -> float:
+    return sum(latency.seconds.get(stage, 0.0) for stage in ON_LINE_STAGES)
 
 
 def _paper_edges(result: RunResult, component: Sequence[VertexId]) -> list[GraphEdge]:

@@ -30,8 +30,8 @@ def export(result: RunResult, out: Path) -> None:
     """Write ``result`` to the directory ``out`` as the design's "What a run leaves behind" has it.
 
     Every file appears whole or not at all, ``run.json`` last; what an earlier run left and this one has no use for is
-    removed. The same result gives the same bytes, except for ``timings`` and ``longest`` in ``run.json``,
-    among which the seconds spent here are entered as ``output``.
+    removed. The same result gives the same bytes, except for ``timings``, ``longest`` and
+    ``latencies`` in ``run.json``; the seconds spent here are entered among the first as ``output``.
     """
     started = time.perf_counter()
     for directory in (out, out / "trajectory", out / "local_maps"):
@@ -91,6 +91,7 @@ def run_record(result: RunResult) -> dict[str, Any]:
         "counts": result.counts,
         "timings": result.timings,
         "longest": result.longest,
+        "latencies": [asdict(latency) for latency in result.latencies],
         "robots": {
             robot: {
                 "scans": len(trajectory.times),

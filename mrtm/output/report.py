@@ -1,6 +1,7 @@
 """What a run and its evaluation have to say, for the terminal."""
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 from rich.console import RenderableType
@@ -8,13 +9,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from mrtm.evaluation import AbsoluteErrors, Evaluation, Meetings, RelationErrors, Statistics
-from mrtm.result import RunResult
+from mrtm.result import Latency, RunResult
 
 FATES = ("accepted", "replaced", "refused")
 
 
 def run_report(result: RunResult) -> list[RenderableType]:
-    """Scans and speed, components, edges by type and fate, timings by stage, blemishes of the logs.
+    """Scans and speed, components, edges by type and fate, timings by stage, latencies, blemishes of the logs.
 
     ``timings["total"]``, if there, is the whole run; else the stages are added up.
     """
@@ -28,6 +29,8 @@ def run_report(result: RunResult) -> list[RenderableType]:
         parts.append(_edges(result))
     if result.timings:
         parts.append(_timings(result))
+    if updates := [latency for latency in result.latencies if latency.robot is not None]:
+        parts.append(latency_table(updates))
     parts += [f"[yellow]{escape(blemish)}[/]" for blemish in result.blemishes]
     return parts
 
@@ -92,6 +95,20 @@ def _timings(result: RunResult) -> Table:
     total = sum(stages.values())  # of all processes together
     for stage, seconds in stages.items():
         table.add_row(escape(stage), f"{seconds:.2f}", f"{100 * seconds / total:.0f}" if total > 0 else "")
+    return table
+
+
+def latency_table(latencies: Sequence[Latency]) -> Table:
+    """From an event to the joint estimate of a robot, by stage and together."""
+    table = Table("from a meeting to the joint estimate, ms")
+    for column in ("median", "p99", "worst", "times"):
+        table.add_column(column, justify="right")
+    stages = dict.fromkeys(stage for latency in latencies for stage in latency.seconds)
+    spent = {stage: [latency.seconds.get(stage, 0.0) for latency in latencies] for stage in stages}
+    spent["together"] = [sum(latency.seconds.values()) for latency in latencies]
+    for stage, seconds in spent.items():
+        numbers = 1e3 * np.array([*np.quantile(seconds, (0.5, 0.99)), max(seconds)])
+        table.add_row(escape(stage), *(f"{number:.1f}" for number in numbers), str(len(seconds)))
     return table
 
 

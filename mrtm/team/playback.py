@@ -11,7 +11,7 @@ from factors import VertexId
 from frontend import se2
 from mrtm.config import Config
 from mrtm.joint.consistency import Verdict
-from mrtm.result import EdgeFate, Meeting, RunResult, SightingFate, TeamStory, Trajectory
+from mrtm.result import EdgeFate, Latency, Meeting, RunResult, SightingFate, TeamStory, Trajectory
 from mrtm.robot.poses import array_of
 from mrtm.team.codec import pack
 from mrtm.team.exchange import exchange
@@ -63,6 +63,7 @@ class Playback:
         self.listener = Teammate(None, config, self._stages, peers)
         self._sightings = _numbered(sightings)
         self._meetings: list[Meeting] = []
+        self._latencies: list[Latency] = []
         self._frames: list[tuple[float, frozenset[str]]] = []  # team time and robots of every new component
 
     def play(self, report: Callable[[float], None]) -> None:
@@ -79,7 +80,9 @@ class Playback:
             self._write_down(data)
         for teammate in self.team.values():
             teammate.learn()
+        before = dict(self._stages.seconds)
         self.listener.settle()
+        self._note(meetings[-1][0] if meetings else 0.0, self.listener, self._stages.since(before))
 
     def agree(self) -> bool:
         """Let all robots meet once more, and tell whether every joint map is then the listener's, pose by pose."""
@@ -106,16 +109,24 @@ class Playback:
     def _meet(self, time: float, robots: tuple[str, str]) -> None:
         """M10 and M11."""
         one, other = (self.team[robot] for robot in robots)
+        before = dict(self._stages.seconds)
         with self._stages("exchange"):
             traffic = exchange(one.store, other.store)
+        exchanged = self._stages.since(before)
         for teammate in (one, other):
             if teammate.is_due():
+                before = dict(self._stages.seconds)
                 teammate.think()
                 teammate.align()
+                self._note(time, teammate, exchanged | self._stages.since(before))
             for robot in teammate.joint.robots.keys() & {teammate.name}:  # none if it has not taken a scan yet
                 self._frames.append((time, frozenset(teammate.joint.component(robot).robots)))
         verdict, reason = _verdict(one, robots)
         self._meetings.append(Meeting(time, robots, dict(traffic.sent), verdict, reason))
+
+    def _note(self, time: float, teammate: Teammate, seconds: dict[str, float]) -> None:
+        vertices = sum(len(c.graph.vertices()) for c in teammate.joint.components())
+        self._latencies.append(Latency(time, teammate.name, vertices, seconds))
 
     def result(self, config: Config) -> RunResult:
         """What is known at the end, in the joint maps of the listener."""
@@ -146,6 +157,7 @@ class Playback:
             blemishes=list(dict.fromkeys(blemish for run in self._runs for blemish in run.blemishes))
             + list(joint.refused.values()),
             team=self._story() if len(self._runs) > 1 else None,
+            latencies=self._latencies,
         )
 
     def _story(self) -> TeamStory:

@@ -14,7 +14,7 @@ from mrtm.compare.table import Row, markdown
 from mrtm.joint.crispness import Crispness
 from mrtm.moving import moved
 from mrtm.output.paper_figures import draw_own_map, draw_same_place
-from mrtm.result import EdgeFate, RunResult, TeamStory
+from mrtm.result import EdgeFate, Latency, RunResult, TeamStory
 from tests.mrtm.sample_run import inside, sample_run
 from tests.mrtm.surface_world import distance
 
@@ -54,6 +54,11 @@ def result() -> RunResult:
         local_maps={v: with_normals(run.vertex_poses[v], m) for v, m in run.local_maps.items()},
         timings={"filter": 10.0, "joint map": 0.25},
         longest={"joint map": 0.01},
+        latencies=[
+            Latency(3.0, "red", 2, {"exchange": 1.0, "joint map": 0.01}),
+            Latency(4.0, "blue", len(TEAM), {"joint map": 0.02, "alignment": 0.03, "judging": 9.0}),
+            Latency(5.0, None, len(TEAM) + 1, {"joint map": 0.05, "alignment": 0.2, "judging": 9.0}),
+        ],
         team=TeamStory([], [], 3.0, 42.0, {}),
     )
 
@@ -86,6 +91,10 @@ def test_em_mends_what_the_tree_gets_wrong(result: RunResult) -> None:
     assert worst["off-line EM"] < 0.015
     assert worst["on line"] == 0.0
     assert on_line.seconds == 0.25
+    assert on_line.updates == em.updates == 2
+    assert on_line.over_run == pytest.approx(0.06)
+    assert on_line.longest == 0.05
+    assert em.over_run == pytest.approx(em.seconds * (2 + len(TEAM)) / (len(TEAM) + 1))
     assert "42 s" in on_line.available
 
 
@@ -123,7 +132,7 @@ def test_compare_scores_and_draws(result: RunResult, relations: Path, tmp_path: 
 
 
 def test_what_was_not_measured_has_no_row() -> None:
-    score = Score("tree only", None, None, None, Crispness(0.2, 0.1, 30.0), 1.0, 0.5, "always")
+    score = Score("tree only", None, None, None, Crispness(0.2, 0.1, 30.0), 1.0, 3, 2.0, 0.5, "always")
     names = [row.name for row in rows((score, score))]
     assert not any("relations" in name or "ATE" in name for name in names)
     assert any("entropy" in name for name in names)

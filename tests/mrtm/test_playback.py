@@ -316,6 +316,35 @@ def test_a_team_without_headings_is_exported_evaluated_and_told(tmp_path: Path) 
     assert "sighting" in console.export_text()
 
 
+def test_every_update_of_a_joint_map_has_its_latency_by_stage(tmp_path: Path) -> None:
+    world, result = three()
+    *updates, at_the_end = result.latencies
+    assert {latency.robot for latency in updates} == set(world.names)
+    times = [m.time for m in story(result).meetings]
+    for latency in updates:
+        met = [m for m in story(result).meetings if m.time == latency.time and latency.robot in m.robots]
+        assert len(met) == 1
+        assert set(latency.seconds) <= {"exchange", "judging", "joint map", "alignment"}
+        assert all(seconds > 0.0 for seconds in latency.seconds.values())
+        assert "exchange" in latency.seconds
+        assert 0 < latency.vertices <= len(result.vertex_poses)
+    assert (at_the_end.robot, at_the_end.time) == (None, times[-1])
+    assert at_the_end.vertices == len(result.vertex_poses)
+    stages = {stage for latency in result.latencies for stage in latency.seconds}
+    for stage in stages:
+        assert sum(latency.seconds.get(stage, 0.0) for latency in (*updates[::2], at_the_end)) <= result.timings[stage]
+    export(result, tmp_path)
+    written = json.loads((tmp_path / "run.json").read_text())["latencies"]
+    assert [entry["robot"] for entry in written] == [latency.robot for latency in result.latencies]
+    console = Console(width=120, record=True, file=io.StringIO())
+    for part in run_report(result):
+        console.print(part)
+    _, _, table = console.export_text().partition("from a meeting to the joint estimate, ms")
+    row = next(line for line in table.splitlines() if "together" in line)
+    worst = 1e3 * max(sum(latency.seconds.values()) for latency in updates)
+    assert [cell.strip() for cell in row.split("│")[-3:-1]] == [f"{worst:.1f}", str(len(updates))]
+
+
 def test_run_json_tells_meetings_and_fates(tmp_path: Path) -> None:
     _, result = three()
     export(result, tmp_path)

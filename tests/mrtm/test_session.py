@@ -48,7 +48,7 @@ def contents(out: Path) -> dict[str, bytes]:
     """Every file by its path below ``out``; run.json without what is allowed to differ."""
     files = {str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()}
     record = json.loads(files["run.json"])
-    times = [key for key in record if key in ("timings", "longest")]
+    times = [key for key in record if key in ("timings", "longest", "latencies")]
     assert "timings" in times
     files["run.json"] = json.dumps({key: value for key, value in record.items() if key not in times}).encode()
     return files
