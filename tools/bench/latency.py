@@ -49,7 +49,7 @@ def main(
 
 def simulated(robots: int, minutes: float, folder: Path) -> Path:
     """The session file of a simulated team."""
-    plan = blocks(0, robots)
+    plan = blocks(0, robots=robots)
     team = simulate_team(plan, list(plan.routes), seconds=60.0 * minutes)
     write_session(team, SightingModel(rate=SIGHTINGS), 0, folder)
     return folder / "team.yaml"
