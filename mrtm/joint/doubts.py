@@ -11,11 +11,11 @@ The work for a change is bounded, however many edges there are.
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import islice
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc, chdtri
 
 from factors import FULL_WEIGHT, EdgeId, EdgeKind, GraphEdge
 from factors.noise import FloatArray
@@ -27,9 +27,15 @@ GATE = {2: 13.82, 3: 30.0}
 """chi2 of so many degrees of freedom that a true edge has at most. Of two 99.9 %, of three what loops of real logs
 need, whose errors have heavier tails."""
 
-CHANCE = 0.01
-"""An edge is judged by itself only where fewer than this share of random false ones, anywhere within 10 m, would pass.
-Loops and alignments of real logs had 0.002 at most."""
+ALLOWED = 0.001
+"""Chance that an edge which comes in by itself is false: that it was, by the share of those that are doubted, and that
+the estimate explains it none the less."""
+
+PRIOR = 0.002
+"""False edges met before the first: robots look twice before they close a loop or align two maps."""
+
+DISTINCT = 0.01
+"""Two edges agree where fewer than this share of random false ones would do so with either."""
 
 CHECKED = 64  # believed edges, and doubted ones, that a change has looked at beside the new ones
 LOOKED = 128  # doubted edges that a new doubted one is held against, the latest
@@ -46,26 +52,30 @@ class Doubts:
         self._agreeing: defaultdict[EdgeId, set[EdgeId]] = defaultdict(set)
         self._next = 0  # place among all edges of the next believed one to be checked
 
-    def settle(self, equations: Equations, new: Sequence[EdgeId]) -> None:
+    def settle(self, equations: Equations, new: Collection[EdgeId]) -> None:
         """Bring a graph that has changed to rest: let in, and put out, until nothing is due.
 
         Args:
             new: edges just added, which are doubted so far.
         """
-        again = list(islice((i for i in equations.doubted if i not in new), CHECKED))
-        for i in again:  # to the end of the queue
-            equations.doubted[i] = equations.doubted.pop(i)
-        waiting = [*new, *again]
         suspects = self._suspects(equations)
-        left: set[EdgeId] = set()
+        went_before: set[EdgeId] = set()
+        unseen = 1  # of the doubted ones, to be looked at before the graph is at rest
         for _ in range(ROUNDS + len(new)):
-            came = self._let_in(equations, [i for i in waiting if i in equations.doubted and i not in left])
-            if not came:
-                came = self._let_in_together(equations, [i for i in new if i in equations.doubted and i not in left])
-            went = self._put_out(equations, suspects + came)
-            left |= {*went}
-            if not came and not went:
+            if unseen <= 0:
                 return
+            again = list(islice((i for i in equations.doubted if i not in new), CHECKED))
+            for i in again:  # to the end of the queue
+                equations.doubted[i] = equations.doubted.pop(i)
+            unseen -= CHECKED
+            waiting = [i for i in (*new, *again) if i in equations.doubted and i not in went_before]
+            came = self._let_in(equations, waiting)
+            if not came:
+                came = self._let_in_together(equations, [i for i in new if i in waiting])
+            went = self._put_out(equations, suspects + came)
+            went_before |= {*went}
+            if came or went:
+                unseen = len(equations.doubted) + 1
 
     def _let_in(self, equations: Equations, waiting: Sequence[EdgeId]) -> list[EdgeId]:
         """All that the estimate agrees with, or else the first one that its uncertainty explains."""
@@ -88,7 +98,7 @@ class Doubts:
         """The first set of edges around a new one that agree with each other and with what cannot be false."""
         for i in new:
             others = [j for j in islice(reversed(equations.doubted), LOOKED) if j != i]
-            for j in agreeing(equations, i, others, _explains):
+            for j in agreeing(equations, i, others, _agree):
                 self._agreeing[i].add(j)
                 self._agreeing[j].add(i)
             members = clique(i, self._agreeing, equations.doubted)
@@ -128,19 +138,27 @@ def chance(covariance: FloatArray) -> float:
     return ball * math.sqrt(max(0.0, float(np.linalg.det(covariance)))) / _FALSE_AREA
 
 
-def _explains(chi2: float, covariance: FloatArray) -> bool:
-    return chi2 <= GATE[len(covariance)] and chance(covariance) < CHANCE
+def _agree(chi2: float, covariance: FloatArray) -> bool:
+    return chi2 <= GATE[len(covariance)] and chance(covariance) < DISTINCT
 
 
 def _is_told_true(equations: Equations, edge: GraphEdge) -> bool:
-    """Whether the estimate explains an edge and would not explain any other as well.
+    """Whether the estimate explains an edge, and would hardly explain a false one.
 
     What sightings fuse to was chosen among all others with the same care (``consistency``).
     """
     chi2, covariance = equations.innovation(edge)
-    if edge.kind in (EdgeKind.FUSING, EdgeKind.SIGHTING):
-        return chi2 <= GATE[len(covariance)]
-    return _explains(chi2, covariance)
+    if chi2 > GATE[len(covariance)]:
+        return False
+    passing = 0.0 if edge.kind in (EdgeKind.FUSING, EdgeKind.SIGHTING) else chance(covariance)
+    return passing < ALLOWED or passing * _share_of_false(equations) < ALLOWED
+
+
+def _share_of_false(equations: Equations) -> float:
+    """Of the edges that may be false; the one that is being judged is among the doubted ones and does not count."""
+    count = sum(edge.kind not in CERTAIN for edge in equations.edges.values())
+    judged = sum(chi2 < math.inf for chi2 in equations.doubted.values())
+    return (PRIOR + judged - 1) / count
 
 
 def _contradicted(equations: Equations, members: Sequence[EdgeId]) -> list[EdgeId] | None:
@@ -180,4 +198,4 @@ def _strained(equations: Equations) -> list[EdgeId]:
 
 def _set_gate(count: int) -> float:
     """What so many true edges add to the least sum of squares at most, more as seldom as one alone beyond its gate."""
-    return float(chi2_distribution.isf(chi2_distribution.sf(GATE[3], 3), 3 * count))
+    return float(chdtri(3 * count, chdtrc(3, GATE[3])))

@@ -323,18 +323,9 @@ class JointGraph:
             out: the edges whose factors go.
         """
         first = {edge.id: self._factor(edge) for edge in judged}
-        late: list[EdgeId] = []
-        # New edges alone can hold no other vertices than new ones.
-        held = self._vertices_but_root() if out else made.keys()
-        holding = list(self._believed()) if out else [self._edges[i] for i in (*settled, *first)]
-        for edge in reversed(judged):  # of several that hold a vertex the first stays, which placed it
-            if edge.kind in CERTAIN:
-                continue
-            tail, head = (made.get(v) or self.estimate(v) for v in (edge.tail, edge.head))
-            strained = misfit(edge, tail, head) > FULL_WEIGHT[len(edge.covariance)]
-            if strained and not cut_off(held, [e for e in holding if e.id != edge.id and e.id not in late]):
-                del first[edge.id]
-                late.insert(0, edge.id)
+        late = self._strained(settled, judged, made, bool(out))
+        for edge_id in late:
+            del first[edge_id]
         values = gtsam.Values()
         for vertex, pose in made.items():
             values.insert(self._keys[vertex], pose)
@@ -342,9 +333,35 @@ class JointGraph:
             self._before = self._smoother.values()
         if settled or first or out:
             self._smoother.update(settled | first, values, out)
-        self._doubted |= dict.fromkeys(late, np.inf)
+        self._doubted |= late
         if out or any(edge.kind not in CERTAIN for edge in judged):
-            self._doubts.settle(self._equations(), late)
+            self._doubts.settle(self._equations(), list(late))
+
+    def _strained(
+        self, settled: Iterable[EdgeId], judged: list[GraphEdge], made: dict[VertexId, gtsam.Pose2], taken: bool
+    ) -> dict[EdgeId, float]:
+        """Those of the edges that come which the estimate does not agree with, and which may wait: they hold nothing.
+
+        Args:
+            taken: edges go as well.
+        """
+        late: dict[EdgeId, float] = {}
+        for edge in judged:
+            if edge.kind not in CERTAIN:
+                tail, head = (made.get(v) or self.estimate(v) for v in (edge.tail, edge.head))
+                if misfit(edge, tail, head) > FULL_WEIGHT[len(edge.covariance)]:
+                    late[edge.id] = np.inf
+        # New edges alone can hold no other vertices than new ones.
+        held = self._vertices_but_root() if taken else made.keys()
+        holding = list(self._believed()) if taken else [self._edges[i] for i in {*settled, *(e.id for e in judged)}]
+        while late:  # of several that hold a vertex the first stays, which placed it
+            lost = cut_off(held, [e for e in holding if e.id not in late])
+            needed = [e for e in map(self._edges.__getitem__, late) if (e.tail in lost) != (e.head in lost)]
+            needed = [e for e in needed if e.estimate is not None]
+            if not needed:
+                break
+            del late[needed[0].id]
+        return late
 
     def _needed(self) -> list[GraphEdge]:
         """Doubted edges, which are so no longer, without which vertices would be cut off."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId, adjoint_transport
+from factors import Edge, EdgeId, EdgeKind, UncertainPose, adjoint_transport
 from factors.sighting import Sighting
 from frontend import se2
 from frontend.local_map import Grid, LocalMap
@@ -45,11 +45,11 @@ class Outcome:
     components: int
 
 
-def feed(problem: Problem, always: bool = True) -> Outcome:
+def feed(problem: Problem, every: int = 1) -> Outcome:
     """Tell a teammate everything, step by step.
 
     Args:
-        always: it thinks after every step; else as seldom as robots that meet do.
+        every: so many steps it thinks, and at the end.
     """
     one = Teammate(None, load_config(), Stages(), Peers())
     steps: defaultdict[int, list[Record]] = defaultdict(list)
@@ -71,7 +71,7 @@ def feed(problem: Problem, always: bool = True) -> Outcome:
         found += alignments[step]
         # All of them: it forgets those between robots that are not in one frame.
         one.aligner.attempts = {(e.tail, e.head): Attempt(_MAPS, e.estimate, None, e, "") for e in found}
-        if always or one.is_due() or step == max(steps):
+        if step % every == 0 or step == max(steps):
             one.think()
     return Outcome(_believed(one, problem), _ate(one, problem), len(one.joint.components()))
 

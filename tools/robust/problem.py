@@ -93,23 +93,23 @@ class Building:
         turn = self._rng.uniform([3.0, 3.0, 0.5], [8.0, 8.0, 2.0])
         while True:
             first = self._random(kind)
-            ends = [
-                (VertexId(v.robot, v.index + n) for v in (first.tail, first.head)) for n in range(count)
-            ]
+            ends = [(VertexId(v.robot, v.index + n) for v in (first.tail, first.head)) for n in range(count)]
             pairs = [(tail, head) for tail, head in ends]
             if all(v in self._truth for pair in pairs for v in pair):
                 return [self._claim(kind, *pair, true=False, moved=gtsam.Pose2(*turn)) for pair in pairs]
 
     def look_alike(self, share: float) -> list[Claim]:
-        """Claims that take a room for another along the building: what is claimed for one is seen in all."""
-        found = []
-        for kind in KINDS:
-            true = [claim for claim in self.problem.claims if claim.kind is kind]
-            for _ in range(round(len(true) * share / (1.0 - share))):
-                model = true[int(self._rng.integers(len(true)))]
-                rooms = int(self._rng.choice([-2, -1, 1, 2]))
-                moved = gtsam.Pose2(PITCH * rooms, 0.0, 0.0)
-                found.append(self._claim(kind, model.tail, model.head, true=False, moved=moved))
+        """Loops and alignments that take a room for another in the same row: all that do so agree with each other."""
+        found: list[Claim] = []
+        for kind in (EdgeKind.LOOP, EdgeKind.ALIGNMENT):
+            true = sum(claim.kind is kind for claim in self.problem.claims)
+            while sum(claim.kind is kind for claim in found) < round(true * share / (1.0 - share)):
+                tail, head = self._random_pair(kind)
+                along, across = self._places[tail] - self._places[head]
+                rooms = round(along / PITCH)
+                if rooms and abs(across) < REACH and self._is_free(kind, tail, head):
+                    moved = gtsam.Pose2(PITCH * rooms, 0.0, 0.0)
+                    found.append(self._claim(kind, tail, head, true=False, moved=moved))
         return found
 
     def _walk(self, robot: str, vertices: int) -> list[Edge]:
@@ -146,16 +146,22 @@ class Building:
                 found.append((tail, head))
         return found
 
-    def _random(self, kind: EdgeKind) -> Claim:
+    def _random_pair(self, kind: EdgeKind) -> tuple[VertexId, VertexId]:
+        """Two vertices that a claim of a kind may be about."""
         vertices = list(self._truth)
         while True:
             tail, head = (vertices[int(i)] for i in self._rng.choice(len(vertices), 2, replace=False))
             if (tail.robot == head.robot) is (kind is EdgeKind.LOOP) and abs(tail.index - head.index) > 1:
-                pose = gtsam.Pose2(*self._rng.uniform([-STEP, -STEP, -np.pi], [STEP, STEP, np.pi]))
-                off = self._truth[tail].between(self._truth[head]).between(pose)
-                far = np.hypot(off.x(), off.y()) > APART or abs(off.theta()) > TURNED
-                if far and self._is_free(kind, tail, head):
-                    return Claim(max(tail.index, head.index), kind, tail, head, pose, _NOISE[kind], False)
+                return tail, head
+
+    def _random(self, kind: EdgeKind) -> Claim:
+        while True:
+            tail, head = self._random_pair(kind)
+            pose = gtsam.Pose2(*self._rng.uniform([-STEP, -STEP, -np.pi], [STEP, STEP, np.pi]))
+            off = self._truth[tail].between(self._truth[head]).between(pose)
+            far = np.hypot(off.x(), off.y()) > APART or abs(off.theta()) > TURNED
+            if far and self._is_free(kind, tail, head):
+                return Claim(max(tail.index, head.index), kind, tail, head, pose, _NOISE[kind], False)
 
     def _claim(
         self, kind: EdgeKind, tail: VertexId, head: VertexId, true: bool, moved: gtsam.Pose2 | None = None
