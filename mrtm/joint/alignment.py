@@ -26,7 +26,7 @@ GATE = 30.0  # chi2 of 3 degrees of freedom, as for loops: farther from the gues
 DISTINCT = 25.0  # squared Mahalanobis distance between two optima that are not one
 SLIDING = 0.92  # of the score at a slid position from which on the position is not seen
 PROBES = (-1.0, -0.6, 0.6, 1.0)  # metres slid to see whether the position matters
-SHARED = 2.0  # times the covariance: a map's errors are in all its alignments, which the graph takes for independent
+SHARED = 1.5  # times the covariance: a map's errors are in all its alignments, which the graph takes for independent
 GUESS_WEIGHT = 0.01  # of the guess's information that goes into an alignment, so that nothing is ever unknown
 
 
