@@ -23,9 +23,9 @@ from mrtm.joint.agreeing import agreeing, clique
 from mrtm.joint.equations import CERTAIN, Equations
 from mrtm.joint.pairs import LEAST_SUPPORT, outnumbers
 
-GATE = {2: 13.82, 3: 30.0}
-"""chi2 of so many degrees of freedom that a true edge has at most. Of two 99.9 %, of three what loops of real logs
-need, whose errors have heavier tails."""
+GATE = {2: 26.99, 3: 30.0}
+"""chi2 of so many degrees of freedom that a true edge has at most: one in 720,000 has more. Loops of real logs need
+that of three, as their errors have heavier tails than they claim."""
 
 ALLOWED = 0.001
 """Chance that an edge which comes in by itself is false: that it was, by the share of those that are doubted, and that
