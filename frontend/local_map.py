@@ -1,6 +1,6 @@
 """What the particle filter leaves behind when the robot leaves a vertex: a grid, the scans it was made of, a cloud."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,23 @@ class Grid:
     origin: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Bends:
+    """How sure the parts of a local map are against its origin.
+
+    A map's scans are drawn at poses that drift along walls that say nothing there: what lies about one place may be
+    slipped against what lies about another, and no fit of surfaces shows it.
+
+    Attributes:
+        places: (k, 2) metres, local frame; none if nothing is known.
+        covariances: (k, 3, 3) of the motion, in the tangent space at the map's origin, by which what lies about each
+            place may be off.
+    """
+
+    places: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    covariances: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
+
+
 @dataclass(frozen=True, slots=True)
 class LocalMap:
     """The metric map of one vertex, in the vertex's ``local`` frame.
@@ -35,6 +52,7 @@ class LocalMap:
         poses: (n, 3) local_T_robot at each of them.
         cloud: (m, 2) points of surfaces, at most one a cell, metres.
         normals: (m, 2) their unit normals, towards where they were seen from; zero where none is known.
+        bends: how sure its parts are.
     """
 
     grid: Grid
@@ -43,6 +61,7 @@ class LocalMap:
     poses: FloatArray
     cloud: FloatArray
     normals: FloatArray
+    bends: Bends = field(default_factory=Bends)
 
 
 def contents(maps: Maps) -> tuple[Grid, FloatArray, FloatArray]:

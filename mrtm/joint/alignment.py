@@ -27,7 +27,6 @@ GATE = 30.0  # chi2 of 3 degrees of freedom, as for loops: farther from the gues
 DISTINCT = 25.0  # squared Mahalanobis distance between two optima that are not one
 SLIDING = 0.92  # of the score at a slid position from which on the position is not seen
 PROBES = (-1.0, -0.6, 0.6, 1.0)  # metres slid to see whether the position matters
-SHARED = 2.0  # times the covariance: a map's errors are in all its alignments, which the graph takes for independent
 GUESS_WEIGHT = 0.01  # of the guess's information that goes into an alignment, so that nothing is ever unknown
 
 
@@ -136,7 +135,7 @@ def _estimate(guess: UncertainPose, best: FloatArray, information: FloatArray, d
     covariance = np.linalg.inv(information + GUESS_WEIGHT * np.linalg.inv(guess.covariance))
     offset = gtsam.Pose2.Logmap(guess.pose.between(pose_of(best)))
     seen = covariance @ information @ offset
-    return UncertainPose(guess.pose.compose(gtsam.Pose2.Expmap(seen)), SHARED * (covariance + drift))
+    return UncertainPose(guess.pose.compose(gtsam.Pose2.Expmap(seen)), covariance + drift)
 
 
 def _refusal(found: Fit, agreed: Agreement, rival: float, moved: float) -> str | None:

@@ -1,8 +1,9 @@
 """What two surfaces that lie on each other say of their relative pose, and how sure it is.
 
 Three things make an alignment wrong. Points scatter about their wall: many points average that. Errors common to a
-stretch of wall do not average within it. And each map is bent: the poses its scans were drawn at drift, away from its
-origin, most where little was in view and along directions in which the walls say nothing.
+stretch of wall do not average within it. And each map is bent: the poses its scans were drawn at drift away from its
+origin, most where little was in view and along directions in which the walls say nothing. That no fit shows; the map
+itself knows of it (``Bends``).
 """
 
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from frontend import se2
+from frontend.local_map import Bends
 from frontend.records import FloatArray
 from mrtm.joint.surface import Surface, partners, rotation
 
@@ -18,13 +20,10 @@ REACH = 0.15  # metres between the points of a pair
 PATCH = 1.5  # metres of a wall that share an error
 POINT, COMMON = 0.005, 0.003  # metres: least standard deviation of a point's own error, and of a patch's
 NORMAL_NOISE = 0.01  # variance of a normal's direction, rad^2: makes a bare wall seem to say something along itself
-# Calibrated by maximum likelihood on simulated pairs in six kinds of buildings (tools/alignment.py shows the NEES):
-SCALE = 2.0  # of the variance from the points: two maps err at the same corners and doors
-DRIFT_XY = 1.2e-3  # m / sqrt(m), and
-DRIFT_THETA = 2.4e-4  # rad / sqrt(m) of a map a metre wide, away from its origin; less in wider ones, in proportion
+# Calibrated on simulated pairs in six kinds of buildings (tools/alignment.py shows the NEES):
+DRAWN = 0.5  # of the covariance of a pose that scans were drawn at: what lies there was drawn at several
 FLOOR = 0.003  # metres: of every alignment, for slips within a map
-FITTING = 0.013  # metres: residual of maps that bend as simulated ones do; those that fit less well bend more
-LEAST_SCATTER = 0.003  # of the normals that still hold a map together in a direction
+NEARBY = 3.0  # metres: places of a map within this tell the same of its error
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,19 +60,11 @@ def fit(a: Surface, b: Surface, a_T_b: FloatArray) -> Fit:
     square = weights @ np.square(points).sum(axis=1)
     noise = np.array([[weights.sum(), 0.0, -y], [0.0, weights.sum(), x], [-y, x, square]])
     values, vectors = np.linalg.eigh(information - NORMAL_NOISE * noise)
-    centre = points.mean(axis=0)
     carried = _adjoint(b_T_a)
-    at_a = rotation(a_T_b[2]) @ centre + a_T_b[:2]
-    drift = _drift(b, centre) + carried @ _drift(a, at_a) @ carried.T
+    drift = _drift(b.bends, points.mean(axis=0)) + carried @ _drift(a.bends, a.points[in_a].mean(axis=0)) @ carried.T
     drift[:2, :2] += FLOOR**2 * np.eye(2)
     residual = float(np.sqrt(np.mean(np.square(residuals))))
-    drift *= max(1.0, residual / FITTING) ** 4
-    return Fit(
-        len(points),
-        residual,
-        (vectors * np.maximum(values, 0.0)) @ vectors.T / SCALE,
-        drift,
-    )
+    return Fit(len(points), residual, (vectors * np.maximum(values, 0.0)) @ vectors.T, drift)
 
 
 def _patches(points: FloatArray, normals: FloatArray) -> npt.NDArray[np.int64]:
@@ -95,23 +86,13 @@ def _weights(residuals: FloatArray, patch: npt.NDArray[np.int64]) -> FloatArray:
     return np.asarray(1.0 / (max(POINT**2, own) + count * max(COMMON**2, common)))[patch]
 
 
-def _drift(surface: Surface, point: FloatArray) -> FloatArray:
-    """(3, 3) covariance, in the map's frame, of what lies at ``point`` against what lies at the origin.
-
-    A random walk along the straight way there: the integral of the adjoints of its steps.
-    """
-    width = max(surface.width, 0.1)
-    x, y = point
-    lever = np.array([y, -x])
-    theta = DRIFT_THETA**2
-    result = np.empty((3, 3))
-    # Inversely with the square: walls that say little in a direction leave whole stretches in which none says anything.
-    held = np.linalg.inv(2.0 * (surface.scatter + LEAST_SCATTER * np.eye(2)))
-    result[:2, :2] = DRIFT_XY**2 * held @ held
-    result[:2, :2] += theta * np.outer(lever, lever) / 3.0
-    result[:2, 2] = result[2, :2] = 0.5 * theta * lever
-    result[2, 2] = theta
-    return np.asarray(result * (np.hypot(x, y) / width**2))
+def _drift(bends: Bends, point: FloatArray) -> FloatArray:
+    """(3, 3) covariance, in the map's frame, of what lies at ``point`` against the map's origin: of the places near."""
+    if not len(bends.places):
+        return np.zeros((3, 3))
+    weights = 1.0 / (NEARBY**2 + np.square(bends.places - point).sum(axis=1)) ** 2
+    values, vectors = np.linalg.eigh(np.average(bends.covariances, axis=0, weights=weights))
+    return np.asarray(DRAWN * (vectors * np.maximum(values, 0.0)) @ vectors.T)  # rounding may have made it indefinite
 
 
 def _adjoint(a_T_b: FloatArray) -> FloatArray:

@@ -1,6 +1,5 @@
 """The joint graph: the vertices and edges of one connected component, and the poses that fit them best."""
 
-from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,17 +18,13 @@ from factors import (
     check_pose,
     edge_from_dict,
     factor_of,
-    has_kernel,
     prior_factor,
-    without_kernel,
 )
+from mrtm.joint.doubts import Doubts
+from mrtm.joint.equations import CERTAIN, Equations, cut_off, misfit
 from mrtm.joint.smoother import Smoother
 
 FloatArray = npt.NDArray[np.float64]
-
-# chi2 of so many degrees of freedom: an edge that the present uncertainty explains this well pulls at once. Of two
-# 99.9 %, of three what loops of real logs need, whose errors have heavier tails.
-_INNOVATION_GATE = {2: 13.82, 3: 30.0}
 
 
 class GraphError(ValueError):
@@ -46,6 +41,9 @@ class JointGraph:
     vertex is connected to the root by edges that fix a pose, always: a range and bearing adds to what is known of
     its ends, and holds nothing.
 
+    An edge that may be false is believed or doubted (``mrtm.joint.doubts``); a doubted one has no effect on the
+    estimate. One that alone holds a vertex is believed.
+
     Args:
         root: the first vertex.
         pose: joint_T_root, the identity unless given.
@@ -60,6 +58,8 @@ class JointGraph:
         self._keys: dict[VertexId, int] = {root: 0}
         self._next_key = 1
         self._edges: dict[EdgeId, GraphEdge] = {}
+        self._doubted: dict[EdgeId, float] = {}  # and chi2 when last judged
+        self._doubts = Doubts()
         values = gtsam.Values()
         values.insert(0, self._root_pose)
         self._smoother = Smoother(prior_factor(0, self._root_pose), {}, values)
@@ -75,8 +75,12 @@ class JointGraph:
         return list(self._keys)
 
     def edges(self) -> list[GraphEdge]:
-        """The present version of every edge, in the order they first came."""
+        """The present version of every edge, believed or doubted, in the order they first came."""
         return list(self._edges.values())
+
+    def doubted(self) -> frozenset[EdgeId]:
+        """The edges that are without effect on the estimate."""
+        return frozenset(self._doubted)
 
     def update(
         self,
@@ -91,10 +95,8 @@ class JointGraph:
         Removals come first. An added edge with one unknown end makes that vertex, placed by the edge; a chain of
         them may come in any order.
 
-        A robust edge that its kernel would weaken, between vertices that are held without it, gets its full weight
-        first if the present uncertainty explains it (``innovation``, 99.9 %), and comes under its kernel at that
-        optimum: else the kernel, which does not know of the drift, would take most true loops for false ones. Any
-        other comes under its kernel at once, and if that weakens it is without effect until the estimate comes near.
+        Of the edges that may be false those that are told true pull at once, the others are doubted until they are; a
+        change may let in edges that were doubted, and put out believed ones (``mrtm.joint.doubts``).
 
         Args:
             add: edges with new ids.
@@ -113,12 +115,12 @@ class JointGraph:
         """Take in another component, which stays as it is: all of it or, on an error, nothing.
 
         The vertices of ``other`` keep their estimates relative to each other; ``bridge`` places them. Its edges come
-        as they are, the robust ones under their kernels: they were judged where they come from.
+        as they are, believed or doubted: they were judged where they come from.
 
         Args:
             other: a component without a vertex or an edge id of this one; its prior is left behind.
             bridge: an edge that fixes a pose, from one component to the other, either way.
-            edges: more new ones, between any of the vertices, weighed as in ``update`` when the bridge is in.
+            edges: more new ones, between any of the vertices, judged as in ``update`` when the bridge is in.
 
         Raises:
             GraphError: the components share a vertex or an edge id, ``bridge`` does not join them, one of ``edges``
@@ -159,10 +161,9 @@ class JointGraph:
         Squared Mahalanobis distance under the covariance of the edge and of the joint estimate together; both
         ends must be in the graph.
         """
-        tail, head = self._key(edge.tail), self._key(edge.head)
-        residual, jacobian = edge.residual(self._smoother.pose(tail).between(self._smoother.pose(head)))
-        covariance = edge.covariance + jacobian @ self._smoother.relative_covariance(tail, head) @ jacobian.T
-        return float(residual @ np.linalg.solve(covariance, residual))
+        for end in (edge.tail, edge.head):
+            self._key(end)
+        return self._equations().innovation(edge)[0]
 
     def chi2(self, edge_id: EdgeId) -> float:
         """Squared residual of an edge at the present estimate over its own covariance, without its kernel.
@@ -172,8 +173,7 @@ class JointGraph:
         """
         if edge_id not in self._edges:
             raise GraphError(f"edge {edge_id} is not in the joint graph")
-        edge = self._edges[edge_id]
-        return _chi2(edge, self.estimate(edge.tail), self.estimate(edge.head))
+        return self._equations().misfit(self._edges[edge_id])
 
     def checkpoint(self) -> dict[str, Any]:
         """All that ``restore`` needs, as plain numbers and strings fit for JSON."""
@@ -182,6 +182,7 @@ class JointGraph:
             "root": _coordinates(self._root_pose),
             "vertices": [[v.robot, v.index, *_coordinates(poses[v])] for v in self._keys],
             "edges": [edge.to_dict() for edge in self._edges.values()],
+            "doubted": [[i.robot, i.number, chi2] for i, chi2 in self._doubted.items()],
         }
 
     @classmethod
@@ -195,30 +196,32 @@ class JointGraph:
         try:
             vertices = {VertexId(row[0], row[1]): gtsam.Pose2(*row[2:]) for row in data["vertices"]}
             graph = cls(next(iter(vertices)), gtsam.Pose2(*data["root"]))
-            rows = data["edges"]
-        except (KeyError, IndexError, TypeError, StopIteration) as error:
+            rows, doubted = data["edges"], {EdgeId(*row[:2]): float(row[2]) for row in data["doubted"]}
+        except (KeyError, IndexError, TypeError, ValueError, StopIteration) as error:
             raise GraphError(f"not a checkpoint of a joint graph: {error!r}") from error
         graph._edges = {edge.id: edge for edge in map(edge_from_dict, rows)}
         graph._keys = {vertex: key for key, vertex in enumerate(vertices)}
         graph._next_key = len(vertices)
+        graph._doubted = {i: chi2 for i, chi2 in doubted.items() if i in graph._edges}
         graph._refuse_cut_off()
         values = gtsam.Values()
         for vertex, key in graph._keys.items():
             values.insert(key, check_pose(vertices[vertex], f"vertex {vertex}"))
-        factors = {edge.id: graph._factor(edge) for edge in graph._edges.values()}
+        factors = {edge.id: graph._factor(edge) for edge in graph._believed()}
         graph._smoother = Smoother(prior_factor(0, graph._root_pose), factors, values)
         return graph
 
     def write_g2o(self, path: Path) -> None:
         """The graph and its estimate for g2o and GTSAM: vertices numbered in the order they came, no kernels.
 
-        Edges that do not fix a pose are left out: neither program reads a range and bearing with lever arms.
+        Doubted edges are left out, and those that do not fix a pose: neither program reads a range and bearing with
+        lever arms.
         Written here, not by ``gtsam.writeG2o``, which keeps six digits and refuses robust factors.
         """
         numbers = {vertex: number for number, vertex in enumerate(self._keys)}
         lines = [("VERTEX_SE2", numbers[v], *_coordinates(pose)) for v, pose in self.estimates().items()]
         upper = np.triu_indices(3)
-        for e in self._edges.values():
+        for e in self._believed():
             if e.estimate is not None:
                 information = np.linalg.inv(e.covariance)[upper].tolist()
                 ends = numbers[e.tail], numbers[e.head]
@@ -232,13 +235,13 @@ class JointGraph:
         What is added comes to the end of the tables, and is taken off again there: a change that only adds costs
         nothing for the rest of the graph. One that takes away works on copies of them.
         """
-        keys, next_key, edges = self._keys, self._next_key, self._edges
+        keys, next_key, edges, doubted = self._keys, self._next_key, self._edges, dict(self._doubted)
         vertices_before, edges_before = len(keys), len(edges)
         self._before = None
         try:
             yield
         except (GraphError, RuntimeError) as error:
-            self._keys, self._next_key, self._edges = keys, next_key, edges
+            self._keys, self._next_key, self._edges, self._doubted = keys, next_key, edges, doubted
             while len(keys) > vertices_before:
                 keys.popitem()
             while len(edges) > edges_before:
@@ -253,7 +256,7 @@ class JointGraph:
         start, values = self._before or self._smoother.start(), gtsam.Values()
         for key in self._keys.values():
             values.insert(key, start.atPose2(key))
-        factors = {edge.id: self._factor(edge) for edge in self._edges.values()}
+        factors = {edge.id: self._factor(edge) for edge in self._believed()}
         self._smoother = Smoother(prior_factor(0, self._root_pose), factors, values)
 
     def _apply(
@@ -276,9 +279,13 @@ class JointGraph:
         made: dict[VertexId, gtsam.Pose2] = {}
         self._place(added, made)
         out = removed | {edge.id for edge in replaced}
+        believed = {i for i in out if i not in self._doubted}
+        self._doubted = {i: chi2 for i, chi2 in self._doubted.items() if i not in out}
+        judged = [*replaced, *added]
         if out:
             self._refuse_cut_off()
-        self._solve({}, [*replaced, *added], made, out)
+            judged += self._needed()
+        self._solve({}, judged, made, believed)
 
     def _absorb(self, other: "JointGraph", bridge: GraphEdge, edges: list[GraphEdge]) -> None:
         """Stage the union of two components, check it, and solve it."""
@@ -294,8 +301,9 @@ class JointGraph:
             if vertex != placed:
                 made[self._enter(vertex)] = joint_T_other.compose(pose)
         self._edges |= other._edges
+        self._doubted |= other._doubted
         self._place(edges, made)
-        settled = {edge.id: self._factor(edge) for edge in (bridge, *other._edges.values())}
+        settled = {edge.id: self._factor(edge) for edge in (bridge, *other._believed())}
         self._solve(settled, edges, made, set())
 
     def _solve(
@@ -305,26 +313,19 @@ class JointGraph:
         made: dict[VertexId, gtsam.Pose2],
         out: set[EdgeId],
     ) -> None:
-        """Bring a staged change to the optimum, in at most three iSAM2 updates, mostly one.
+        """Bring a staged change to the optimum.
 
         Args:
             settled: factors that come as they are.
-            judged: edges whose weight at the start ``innovation`` decides, if the kernel would weaken them.
+            judged: edges that come; those that may be false are believed at once if nothing is strained by them or if
+                they hold a vertex, the others when they are told true.
             made: joint_T_vertex of the vertices that are new.
             out: the edges whose factors go.
         """
         first = {edge.id: self._factor(edge) for edge in judged}
-        late: dict[EdgeId, gtsam.NoiseModelFactor] = {}
-        # New edges alone can hold no other vertices than new ones.
-        held = self._vertices_but_root() if out else made.keys()
-        holding = [self._edges[i] for i in (self._edges if out else [*settled, *first])]
-        for edge in reversed(judged):  # of several that hold a vertex the first stays, which placed it
-            if not has_kernel(first[edge.id]):
-                continue
-            tail, head = (made.get(v) or self.estimate(v) for v in (edge.tail, edge.head))
-            strained = _chi2(edge, tail, head) > FULL_WEIGHT[len(edge.covariance)]
-            if strained and not _cut_off(held, [e for e in holding if e.id != edge.id and e.id not in late]):
-                late[edge.id] = first.pop(edge.id)
+        late = self._strained(settled, judged, made, bool(out))
+        for edge_id in late:
+            del first[edge_id]
         values = gtsam.Values()
         for vertex, pose in made.items():
             values.insert(self._keys[vertex], pose)
@@ -332,15 +333,53 @@ class JointGraph:
             self._before = self._smoother.values()
         if settled or first or out:
             self._smoother.update(settled | first, values, out)
-        if late:
-            eager = {i for i in late if self._is_explained(self._edges[i])}
-            start = {i: without_kernel(f) if i in eager else f for i, f in late.items()}
-            self._smoother.update(start, gtsam.Values(), ())
-            if eager:
-                self._smoother.update({i: late[i] for i in eager}, gtsam.Values(), eager)
+        self._doubted |= late
+        if out or any(edge.kind not in CERTAIN for edge in judged):
+            self._doubts.settle(self._equations(), list(late))
 
-    def _is_explained(self, edge: GraphEdge) -> bool:
-        return self.innovation(edge) <= _INNOVATION_GATE[len(edge.covariance)]
+    def _strained(
+        self, settled: Iterable[EdgeId], judged: list[GraphEdge], made: dict[VertexId, gtsam.Pose2], taken: bool
+    ) -> dict[EdgeId, float]:
+        """Those of the edges that come which the estimate does not agree with, and which may wait: they hold nothing.
+
+        Args:
+            taken: edges go as well.
+        """
+        late: dict[EdgeId, float] = {}
+        for edge in judged:
+            if edge.kind not in CERTAIN:
+                tail, head = (made.get(v) or self.estimate(v) for v in (edge.tail, edge.head))
+                if misfit(edge, tail, head) > FULL_WEIGHT[len(edge.covariance)]:
+                    late[edge.id] = np.inf
+        # New edges alone can hold no other vertices than new ones.
+        held = self._vertices_but_root() if taken else made.keys()
+        holding = list(self._believed()) if taken else [self._edges[i] for i in {*settled, *(e.id for e in judged)}]
+        while late:  # of several that hold a vertex the first stays, which placed it
+            lost = cut_off(held, [e for e in holding if e.id not in late])
+            needed = [e for e in map(self._edges.__getitem__, late) if (e.tail in lost) != (e.head in lost)]
+            needed = [e for e in needed if e.estimate is not None]
+            if not needed:
+                break
+            del late[needed[0].id]
+        return late
+
+    def _needed(self) -> list[GraphEdge]:
+        """Doubted edges, which are so no longer, without which vertices would be cut off."""
+        needed: list[GraphEdge] = []
+        for edge in [self._edges[i] for i in self._doubted]:
+            lost = cut_off(self._vertices_but_root(), self._believed())
+            if not lost:
+                break
+            if (edge.tail in lost) != (edge.head in lost) and edge.estimate is not None:
+                del self._doubted[edge.id]
+                needed.append(edge)
+        return needed
+
+    def _believed(self) -> Iterator[GraphEdge]:
+        return (edge for i, edge in self._edges.items() if i not in self._doubted)
+
+    def _equations(self) -> Equations:
+        return Equations(self._smoother, self._keys, self._edges, self._doubted)
 
     def _check_replacement(self, edge: GraphEdge) -> None:
         old = self._edges.get(edge.id)
@@ -381,7 +420,7 @@ class JointGraph:
         return vertex
 
     def _refuse_cut_off(self) -> None:
-        lost = _cut_off(self._vertices_but_root(), self._edges.values())
+        lost = cut_off(self._vertices_but_root(), self._edges.values())
         if lost:
             names = ", ".join(str(v) for v in sorted(lost))
             raise GraphError(f"vertices {names} would be cut off from root {self._root}: remove them as well")
@@ -401,29 +440,6 @@ class JointGraph:
 def _joins(edge: GraphEdge, some: Collection[VertexId], others: Collection[VertexId]) -> bool:
     """Whether one end is among ``some`` and the other among ``others``."""
     return (edge.tail in some and edge.head in others) or (edge.head in some and edge.tail in others)
-
-
-def _cut_off(vertices: Collection[VertexId], edges: Iterable[GraphEdge]) -> set[VertexId]:
-    """Those of ``vertices`` that no path of edges which fix a pose joins to a vertex that is none of them."""
-    neighbours: defaultdict[VertexId, list[VertexId]] = defaultdict(list)
-    for edge in edges:
-        if edge.estimate is not None:
-            neighbours[edge.tail].append(edge.head)
-            neighbours[edge.head].append(edge.tail)
-    lost = set(vertices)
-    frontier = [vertex for vertex in neighbours if vertex not in lost]
-    while frontier:
-        for vertex in neighbours[frontier.pop()]:
-            if vertex in lost:
-                lost.remove(vertex)
-                frontier.append(vertex)
-    return lost
-
-
-def _chi2(edge: GraphEdge, tail: gtsam.Pose2, head: gtsam.Pose2) -> float:
-    """Squared residual over the edge's covariance, its ends at joint_T_tail and joint_T_head."""
-    residual, _ = edge.residual(tail.between(head))
-    return float(residual @ np.linalg.solve(edge.covariance, residual))
 
 
 def _coordinates(pose: gtsam.Pose2) -> list[float]:

@@ -5,9 +5,12 @@ from dataclasses import dataclass, field
 
 import gtsam
 
-from factors import Edge, EdgeId, GraphEdge, VertexId
+from factors import Edge, EdgeId, EdgeKind, GraphEdge, VertexId
 from mrtm.joint.graph import GraphError, JointGraph
 from mrtm.joint.own_graph import own_graph, refusal
+
+FUSED = {EdgeKind.FUSING, EdgeKind.SIGHTING}
+"""What sightings make; alignments refine where these have put robots."""
 
 
 @dataclass(slots=True)
@@ -18,11 +21,13 @@ class Component:
         robots: ascending.
         graph: all their edges, and those added; without added ones the robot's own graph.
         added: what came to them: edges between robots, and alignments of maps, by their ids.
+        contradicted: those that sightings made and the graph doubted when it was made.
     """
 
     robots: tuple[str, ...]
     graph: JointGraph
     added: dict[EdgeId, GraphEdge] = field(default_factory=dict)
+    contradicted: frozenset[EdgeId] = frozenset()
 
 
 class JointMap:
@@ -118,7 +123,8 @@ class JointMap:
             if component.robots == robots and component.added.keys() and mine:
                 try:
                     _exchange(component, mine)
-                    continue
+                    if _contradicted(component) <= component.contradicted:
+                        continue
                 except GraphError:
                     pass  # perhaps on the way there only
             try:
@@ -129,6 +135,7 @@ class JointMap:
                 self._refuse(next(iter(mine.values())), error)
                 self._apart(robots)
             else:
+                component.contradicted = _contradicted(component)
                 self._component.update(dict.fromkeys(robots, component))
 
     def _refuse(self, edge: GraphEdge, error: GraphError) -> None:
@@ -169,20 +176,23 @@ class JointMap:
             return self._own[root]
         graph = JointGraph(VertexId(root, 0))
         graph.update(add=self._own[root].edges())
-        graph.update(add=[e for e in added.values() if _ends(e) == {root}])
         self._merge(graph, {root}, robots, added)
         return graph
 
     def _merge(
         self, graph: JointGraph, reached: set[str], robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]
     ) -> None:
-        """Take the other robots' own graphs into that of those ``reached``, whose added edges it has."""
+        """Take the other robots' own graphs into that of those ``reached``; what sightings made comes first."""
+        fused = {i: e for i, e in added.items() if e.kind in FUSED}
         while len(reached) < len(robots):
-            bridge = next(e for e in added.values() if e.estimate and _ends(e) & reached and _ends(e) - reached)
+            edges = (*fused.values(), *added.values())
+            bridge = next(e for e in edges if e.estimate and _ends(e) & reached and _ends(e) - reached)
             both = reached | _ends(bridge)
-            more = [e for e in added.values() if e is not bridge and _ends(e) <= both and not _ends(e) <= reached]
+            more = [e for e in fused.values() if e is not bridge and _ends(e) <= both and not _ends(e) <= reached]
             graph.merge(self._own[(both - reached).pop()], bridge, more)
             reached = both
+        known = {edge.id for edge in graph.edges()}
+        graph.update(add=[e for i, e in added.items() if i not in known])
 
 
 def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
@@ -196,6 +206,15 @@ def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
     if replace or gone:
         component.graph.update(replace=replace, remove=gone)
     component.added = added
+
+
+def _contradicted(component: Component) -> frozenset[EdgeId]:
+    """What sightings made and the graph doubts.
+
+    They may have been judged otherwise since, and alignments from where robots seemed to be may hold these there.
+    """
+    added = component.added
+    return frozenset(i for i in component.graph.doubted() & added.keys() if added[i].kind in FUSED)
 
 
 def _ends(edge: GraphEdge) -> set[str]:

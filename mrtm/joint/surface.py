@@ -1,18 +1,28 @@
 """A local map as alignment takes it: surface points that know which way they face, and what they are good for."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numba
 import numpy as np
 import numpy.typing as npt
 
+from frontend.local_map import Bends
 from frontend.records import FloatArray
-from mrtm.joint.agreement import FREE, Lookup, SurfaceMap
+from mrtm.joint.agreement import Lookup, SurfaceMap
 from mrtm.joint.buckets import Buckets, nearest
 
 FACING = 0.7
 """Least cosine between the normals of two points of one surface. Walls are thin: the nearest point of another map is
 often on the back of the wall, in the next room, and would pull the rooms into each other."""
+
+
+class AlignedMap(SurfaceMap, Protocol):
+    """What is needed of a local map that is to be aligned."""
+
+    @property
+    def bends(self) -> Bends:
+        """How sure its parts are."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -21,27 +31,21 @@ class Surface:
 
     Attributes:
         buckets: those points of its cloud whose normal is known, local frame.
-        scatter: (2, 2) mean outer product of the normals, trace one: how much the walls say in each direction.
-        width: metres of free space in front of a wall, on average: about 1 in corridors and small rooms, 4 in a hall.
         lookup: the grid, for comparing.
+        bends: how sure the map's parts are.
     """
 
     buckets: Buckets
-    scatter: FloatArray
-    width: float
     lookup: Lookup
+    bends: Bends = field(default_factory=Bends)
 
     @classmethod
-    def of(cls, local_map: SurfaceMap) -> "Surface":
+    def of(cls, local_map: AlignedMap) -> "Surface":
         """Prepare a local map."""
         known = np.einsum("ni,ni->n", local_map.normals, local_map.normals) > 0.25
         points = np.ascontiguousarray(local_map.cloud[known], np.float64)
         normals = np.ascontiguousarray(local_map.normals[known], np.float64)
-        scatter = normals.T @ normals / max(1, len(normals))
-        grid = local_map.grid
-        free = np.count_nonzero(grid.log_odds <= FREE) * grid.resolution
-        width = free / max(1, len(local_map.cloud))
-        return cls(Buckets.of(points, normals), scatter, width, Lookup.of(local_map))
+        return cls(Buckets.of(points, normals), Lookup.of(local_map), local_map.bends)
 
     @property
     def points(self) -> FloatArray:

@@ -18,6 +18,9 @@ LATEST = 1e12
 """Seconds, either way."""
 LARGEST_GRID = 4000
 """Cells along one side."""
+MOST_PLACES = 64
+"""Of a local map whose sureness is told."""
+
 MOST_POINTS = 2**20
 """Occupied cells of a grid, points of a cloud."""
 FINEST, COARSEST = 0.001, 10.0

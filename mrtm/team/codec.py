@@ -13,8 +13,9 @@ import numpy as np
 
 from factors import Edge, EdgeId, FactorError, UncertainPose, VertexId
 from factors.sighting import Sighting
+from frontend.local_map import Bends
 from frontend.records import FloatArray
-from mrtm.team.checks import RecordError
+from mrtm.team.checks import MOST_PLACES, RecordError
 from mrtm.team.map_codec import PackedMap, pack_map, unpack_map
 from mrtm.team.records import (
     TOLD_EDGES,
@@ -36,6 +37,7 @@ KINDS = tuple(Kind)
 _LONGEST_ROW = 16
 _UPPER = np.triu_indices(3)
 _POSE = struct.Struct("<9d")
+_BENDS, _BEND = np.dtype("<f4"), 8 * 4  # of each place x, y, and the upper half of its covariance
 _SIGHTING, _SIGHTING_WITHOUT_HEADING = struct.Struct("<6d"), struct.Struct("<4d")
 
 
@@ -86,7 +88,7 @@ def _body(record: Record, robot: str) -> list[Any]:
             anchors = [record.observer_anchor[1], record.observed_anchor[1]]
             return [record.observed, *anchors, _pack_sighting(record.measurement)]
         case MapRecord():
-            return [*pack_map(record.grid, record.cloud, record.normals)]
+            return [*pack_map(record.grid, record.cloud, record.normals), _pack_bends(record.bends)]
 
 
 def _record(row: "_Row") -> Record:
@@ -116,7 +118,7 @@ def _record(row: "_Row") -> Record:
             frame = row.real("resolution"), row.real("origin x"), row.real("origin y")
             columns = [row.data(name) for name in PackedMap._fields[5:]]
             grid, cloud, normals = unpack_map(PackedMap(*sides, *frame, *columns), row.what)
-            return MapRecord(VertexId(robot, number), version, time, grid, cloud, normals)
+            return MapRecord(VertexId(robot, number), version, time, grid, cloud, normals, row.bends("bends"))
 
 
 def _pack_vertex(vertex: VertexId, robot: str) -> int | list[Any]:
@@ -126,6 +128,12 @@ def _pack_vertex(vertex: VertexId, robot: str) -> int | list[Any]:
 
 def _pack_pose(pose: gtsam.Pose2, covariance: FloatArray) -> bytes:
     return _POSE.pack(pose.x(), pose.y(), pose.theta(), *covariance[_UPPER])
+
+
+def _pack_bends(bends: Bends) -> bytes:
+    rows, columns = _UPPER
+    upper = bends.covariances[:, rows, columns]
+    return np.column_stack([bends.places, upper]).astype(_BENDS).tobytes()
 
 
 def _pack_sighting(sighting: Sighting) -> bytes:
@@ -197,6 +205,15 @@ class _Row:
         covariance[_UPPER] = upper
         covariance.T[_UPPER] = upper
         return UncertainPose(gtsam.Pose2(x, y, theta), covariance)
+
+    def bends(self, name: str) -> Bends:
+        data = self.data(name)
+        if len(data) % _BEND or len(data) > MOST_PLACES * _BEND:
+            raise self._refused(name, data, f"at most {MOST_PLACES} places of {_BEND} bytes")
+        numbers = np.frombuffer(data, _BENDS).astype(np.float64).reshape(-1, 8)
+        (rows, columns), covariances = _UPPER, np.empty((len(numbers), 3, 3))
+        covariances[:, rows, columns] = covariances[:, columns, rows] = numbers[:, 2:]
+        return Bends(numbers[:, :2], covariances)
 
     def end(self) -> None:
         if self._next != len(self._fields):

@@ -12,21 +12,24 @@ import numpy.typing as npt
 
 from factors import Edge, UncertainPose, VertexId
 from frontend import se2
-from frontend.local_map import LocalMap, contents
+from frontend.local_map import Bends, LocalMap, contents
 from frontend.local_slam import Visit
 from frontend.records import FloatArray, LaserScan
 from mrtm.config import Config
+from mrtm.joint.common_frame import adjoint
 from mrtm.joint.graph import JointGraph
 from mrtm.result import EdgeFate, Event
 from mrtm.robot.poses import pose_of
 from mrtm.robot.robot import Robot
 from mrtm.robot.topology import Vertex
+from mrtm.team.checks import MOST_PLACES
 from mrtm.team.codec import pack, unpack
 from mrtm.team.records import AnchorRecord, EdgeRecord, MapRecord, Record, VertexRecord
 from mrtm.timing import Stages
 
 GAP = 5.0  # seconds between two scans: where the robot was in between cannot be told
 EXACT = np.diag([1e-3, 1e-3, 1e-4]) ** 2  # covariance of a pose that defines its vertex, for others to divide by
+SQUARE = 3.0  # metres: what a map tells of its sureness, once in each
 
 
 @dataclass(slots=True)
@@ -174,7 +177,8 @@ class _Story:
         version = self._versions[vertex.id] = self._versions.get(vertex.id, 0) + 1
         local_map = local_map_of(vertex, np.array(self.times))
         self.tell(VertexRecord(vertex.id, version, self.now, len(local_map.scans)))
-        self.tell(MapRecord(vertex.id, version, self.now, local_map.grid, local_map.cloud, local_map.normals))
+        drawn = local_map.grid, local_map.cloud, local_map.normals, local_map.bends
+        self.tell(MapRecord(vertex.id, version, self.now, *drawn))
         for anchor in self._anchors:
             if first <= anchor.scan < first + len(visit.poses):
                 anchor.version = max(anchor.version, 0)  # what comes is refined, even if nothing was told before
@@ -236,4 +240,19 @@ def local_map_of(vertex: Vertex, times: FloatArray) -> LocalMap:
     # A visit that was resumed has the scan of the seam twice; the later pose is the one that had the whole map.
     scans, order = np.unique(np.array(vertex.scans, np.int64)[::-1], return_index=True)
     order = len(vertex.scans) - 1 - order
-    return LocalMap(grid, scans, times[scans], np.array(vertex.poses)[order], cloud, normals)
+    poses = np.array(vertex.poses)[order]
+    return LocalMap(grid, scans, times[scans], poses, cloud, normals, _bends(vertex))
+
+
+def _bends(vertex: Vertex) -> Bends:
+    """What the covariances of the poses that a map was drawn at say of its parts: their means over squares."""
+    carry = adjoint(vertex.places)
+    covariances = carry @ vertex.covariances @ np.swapaxes(carry, -1, -2)
+    covariances = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
+    places, side, count = vertex.places[:, :2], SQUARE, MOST_PLACES + 1
+    while count > MOST_PLACES:
+        squares, which = np.unique(np.floor(places / side), axis=0, return_inverse=True)
+        count, side = len(squares), 2.0 * side
+    members = which.ravel() == np.arange(count)[:, None]
+    share = members / members.sum(axis=1, keepdims=True)
+    return Bends(share @ places, np.einsum("sk,kij->sij", share, covariances))

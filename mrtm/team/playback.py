@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import gtsam
 import numpy as np
 
-from factors import VertexId
+from factors import GraphEdge, VertexId
 from frontend import se2
 from mrtm.config import Config
 from mrtm.joint.consistency import Verdict
+from mrtm.joint.graph import JointGraph
 from mrtm.result import EdgeFate, Latency, Meeting, RunResult, SightingFate, TeamStory, Trajectory
 from mrtm.robot.poses import array_of
 from mrtm.team.codec import pack
@@ -134,7 +135,8 @@ class Playback:
         components = joint.components()
         poses = {v: pose for c in components for v, pose in c.graph.estimates().items()}
         edges = [fate for run in self._runs for fate in run.past]
-        edges += [EdgeFate(e, "accepted", chi2=c.graph.chi2(e.id)) for c in components for e in c.graph.edges()]
+        graphs = [component.graph for component in components]
+        edges += [_edge_fate(graph, edge) for graph in graphs for edge in graph.edges()]
         stages = [*((run.seconds, run.longest) for run in self._runs), (self._stages.seconds, self._stages.longest)]
         names = list(dict.fromkeys(name for seconds, _ in stages for name in seconds))
         return RunResult(
@@ -152,7 +154,7 @@ class Playback:
             counts={
                 "scans": sum(len(run.times) for run in self._runs),
                 "vertices": len(poses),
-                "edges": sum(len(c.graph.edges()) for c in components),
+                "edges": sum(len(graph.edges()) - len(graph.doubted()) for graph in graphs),
             },
             blemishes=list(dict.fromkeys(blemish for run in self._runs for blemish in run.blemishes))
             + list(joint.refused.values()),
@@ -180,6 +182,13 @@ class Playback:
         if judgement.chi2 is not None:
             numbers["chi2"] = judgement.chi2
         return SightingFate(*ends, str(judgement.verdict), judgement.reason, numbers)
+
+
+def _edge_fate(graph: JointGraph, edge: GraphEdge) -> EdgeFate:
+    chi2 = graph.chi2(edge.id)
+    if edge.id in graph.doubted():
+        return EdgeFate(edge, "refused", f"chi2 {chi2:.1f} from the joint estimate: without effect", chi2)
+    return EdgeFate(edge, "accepted", chi2=chi2)
 
 
 def _numbered(sightings: Sequence[TimedSighting]) -> list[SightingRecord]:

@@ -6,7 +6,7 @@ Times are team times, seconds.
 
 import math
 import reprlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import ClassVar, NamedTuple
 
@@ -14,11 +14,12 @@ import numpy as np
 
 from factors import Edge, EdgeKind, FactorError, UncertainPose, VertexId, check_covariance
 from factors.sighting import Sighting
-from frontend.local_map import Grid
+from frontend.local_map import Bends, Grid
 from frontend.records import FloatArray
 from mrtm.team.checks import (
     FARTHEST,
     LATEST,
+    MOST_PLACES,
     MOST_POINTS,
     RecordError,
     check,
@@ -117,6 +118,7 @@ class MapRecord:
             ``mrtm.team.map_codec`` says.
         cloud: (m, 2) points of surfaces, metres.
         normals: (m, 2) their unit normals, zero where none is known.
+        bends: how sure the map's parts are, at MOST_PLACES places at most; travels in single precision.
     """
 
     kind: ClassVar[Kind] = Kind.MAP
@@ -126,6 +128,7 @@ class MapRecord:
     grid: Grid
     cloud: FloatArray
     normals: FloatArray
+    bends: Bends = field(default_factory=Bends)
 
     def __post_init__(self) -> None:
         _check_header(self)
@@ -140,6 +143,21 @@ class MapRecord:
         odd = squared[(np.abs(squared - 1.0) > 1e-4) & (squared != 0.0)]
         if len(odd):
             check(False, what, "length of a normal", math.sqrt(odd[0]), "1, or 0 if unknown")
+        places, covariances = self.bends.places, self.bends.covariances
+        check(len(places) <= MOST_PLACES, what, "number of places", len(places), f"at most {MOST_PLACES}")
+        check_array(places, (len(places), 2), np.float64, what, "places")
+        check_array(covariances, (len(places), 3, 3), np.float64, what, "covariances of places")
+        if len(places):
+            check(
+                np.array_equal(covariances, np.swapaxes(covariances, 1, 2)),
+                what,
+                "covariances of places",
+                "lopsided",
+                "symmetric",
+            )
+            values = np.linalg.eigvalsh(covariances)
+            good = bool(np.all(values[:, 0] >= -_ROUNDED * values[:, 2]))
+            check(good, what, "eigenvalues of a covariance", values[:, 0].min(), "at least 0")
 
     @property
     def key(self) -> Key:
@@ -206,10 +224,10 @@ class SightingRecord:
         what = _what(self)
         check_name(self.observed, what, "observed")
         check(self.observed != self.observer, what, "observed", self.observed, "another robot than the observer")
-        for field, robot in (("observer", self.observer), ("observed", self.observed)):
-            owner, number = getattr(self, f"{field}_anchor")
-            check(owner == robot, what, f"{field}_anchor", owner, f"one of {robot}")
-            check_whole(number, what, f"{field}_anchor")
+        for name, robot in (("observer", self.observer), ("observed", self.observed)):
+            owner, number = getattr(self, f"{name}_anchor")
+            check(owner == robot, what, f"{name}_anchor", owner, f"one of {robot}")
+            check_whole(number, what, f"{name}_anchor")
         check(self.measurement.range <= FARTHEST, what, "range", self.measurement.range, f"at most {FARTHEST:g} m")
 
     @property
@@ -217,6 +235,8 @@ class SightingRecord:
         """(sighting, observer, number)."""
         return Key(self.kind, self.observer, self.number)
 
+
+_ROUNDED = 1e-6  # of a covariance in single precision
 
 Record = VertexRecord | EdgeRecord | MapRecord | AnchorRecord | SightingRecord
 

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
 from factors.sighting import Sighting
-from frontend.local_map import Grid, contents
+from frontend.local_map import Bends, Grid, contents
 from mrtm.team.records import (
     AnchorRecord,
     EdgeRecord,
@@ -46,7 +46,9 @@ def record_of(kind: Kind, robot: str = "red", number: int = 3, version: int = 0,
             log_odds = np.zeros((3, 5), np.float32)
             log_odds[1, 1:3], log_odds[1, 3] = -2.0, 4.0
             points, normals = np.array([[1.18, 2.07]]), np.array([[-1.0, 0.0]])
-            return MapRecord(VertexId(robot, number), version, time, grid_of(log_odds), points, normals)
+            bends = Bends(np.array([[1.0, value], [4.0, -2.5]]), np.stack([COVARIANCE, np.diag([0.25, 0.0, 0.0])]))
+            drawn = grid_of(log_odds), points, normals, bends
+            return MapRecord(VertexId(robot, number), version, time, *drawn)
 
 
 def grid_of(log_odds: npt.ArrayLike, origin: tuple[float, float] = (1.0, 2.0)) -> Grid:

@@ -1,6 +1,7 @@
 """Two maps of a made-up room: alignment must find how they lie, say how sure it is, and refuse what is wrong."""
 
 import ctypes
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -9,11 +10,12 @@ import pytest
 
 from factors import UncertainPose
 from frontend import se2
+from frontend.local_map import Bends
 from frontend.records import FloatArray
 from mrtm.joint.alignment import Alignment, align
 from mrtm.joint.buckets import Buckets
 from mrtm.joint.correlative import hypotheses
-from mrtm.joint.fit import fit
+from mrtm.joint.fit import DRAWN, FLOOR, fit
 from mrtm.joint.icp import COARSE, FINE, SCALE, icp
 from mrtm.joint.surface import Surface, partners, rotation
 from mrtm.robot.poses import array_of, pose_of
@@ -122,15 +124,24 @@ def test_information_does_not_count_points_that_share_an_error(room: tuple[Surfa
     independent = fit(a, b, TRUE)
     # The same walls, but each stretch of a metre off by a centimetre as a whole.
     bent = b.points + 0.012 * rng.standard_normal(40)[np.abs(b.points.sum(axis=1)).astype(int)][:, None] * b.normals
-    common = fit(a, Surface(Buckets.of(bent, b.normals), b.scatter, b.width, b.lookup), TRUE)
+    common = fit(a, Surface(Buckets.of(bent, b.normals), b.lookup), TRUE)
     assert common.residual < 2.0 * independent.residual
     assert np.trace(common.information) < 0.5 * np.trace(independent.information)
 
 
-def test_far_from_the_origin_the_covariance_grows(room: tuple[Surface, Surface]) -> None:
-    near, far = fit(*room, TRUE), fit(seen(ROOM, np.array([-20.0, 4.0, 0.0]), -1, 10, 1), room[1],
-                                      se2.between(np.array([-20.0, 4.0, 0.0]), B))  # fmt: skip
-    assert np.linalg.eigvalsh(far.drift)[2] > 1.5 * np.linalg.eigvalsh(near.drift)[2]
+def test_a_map_that_is_unsure_of_its_parts_makes_the_alignment_so_there(room: tuple[Surface, Surface]) -> None:
+    a, b = room
+    firm = fit(a, b, TRUE)
+    assert np.array_equal(firm.drift, np.diag([FLOOR, FLOOR, 0.0]) ** 2)
+    here = b.points[partners(a, b, TRUE, 0.15)[1]].mean(axis=0)
+    sure, slipped = np.diag([0.01, 0.01, 0.001]) ** 2, np.diag([0.2, 0.01, 0.001]) ** 2
+    for near, far, expected in ((slipped, sure, slipped), (sure, slipped, sure)):
+        bends = Bends(np.array([here, here + 40.0]), np.array([near, far]))
+        found = fit(a, replace(b, bends=bends), TRUE)
+        np.testing.assert_allclose(found.drift - firm.drift, DRAWN * expected, rtol=0.05, atol=1e-6)
+        turned = fit(replace(b, bends=bends), a, se2.inverse(TRUE))  # in the frame of the other
+        back = pose_of(TRUE).AdjointMap()
+        np.testing.assert_allclose(turned.drift - firm.drift, DRAWN * back @ expected @ back.T, rtol=0.1, atol=1e-5)
 
 
 def test_rooms_that_look_alike_are_refused() -> None:

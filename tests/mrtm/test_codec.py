@@ -1,5 +1,6 @@
 """Records to bytes and back; bytes of others, whatever they are."""
 
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -10,10 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from factors import VertexId
+from frontend.local_map import Bends
 from mrtm.team import codec
 from mrtm.team.checks import RecordError
 from mrtm.team.codec import pack, unpack
-from mrtm.team.records import AnchorRecord, EdgeRecord, Kind, SightingRecord, VertexRecord
+from mrtm.team.records import AnchorRecord, EdgeRecord, Kind, MapRecord, SightingRecord, VertexRecord
 from tests.mrtm.record_examples import record_of, room_map
 
 SMALL = [Kind.VERTEX, Kind.EDGE, Kind.ANCHOR, Kind.SIGHTING]
@@ -45,6 +47,25 @@ def test_small_records_come_back_exactly_in_less_than_120_bytes(kind: Kind, numb
             assert again.vertex == record.vertex
             assert same_pose(record.pose.pose, again.pose.pose)
             np.testing.assert_array_equal(record.pose.covariance, again.pose.covariance)
+
+
+def test_how_sure_the_parts_of_a_map_are_comes_back_in_single_precision() -> None:
+    record = record_of(Kind.MAP)
+    again = unpack(pack(record))
+    assert isinstance(record, MapRecord)
+    assert isinstance(again, MapRecord)
+    np.testing.assert_allclose(again.bends.places, record.bends.places, rtol=1e-7)
+    np.testing.assert_allclose(again.bends.covariances, record.bends.covariances, rtol=1e-7)
+    bare = replace(record, bends=Bends())
+    assert len(pack(record)) - len(pack(bare)) == 2 * 32
+    assert unpack(pack(bare)).bends.places.shape == (0, 2)  # type: ignore[union-attr]
+
+
+def test_places_that_are_cut_off_are_refused() -> None:
+    fields = msgpack.unpackb(pack(record_of(Kind.MAP)))
+    for bad in (fields[-1][:-1], fields[-1] * 40):
+        with pytest.raises(RecordError, match=r"bends is .* at most 64 places of 32 bytes"):
+            unpack(msgpack.packb([*fields[:-1], bad]))
 
 
 def test_the_vertex_of_another_robot_keeps_its_name() -> None:

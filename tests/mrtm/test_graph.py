@@ -282,7 +282,7 @@ def test_a_second_step_that_fails_takes_back_the_first(
     new = Edge(
         EdgeId("red", 80), 0, EdgeKind.INTER_VERTEX, vertex(8), vertex(20), gtsam.Pose2(3.0, 0.0, 0.0), STEP_COVARIANCE
     )
-    strained = world.edge(81, 5, 0, EdgeKind.LOOP, off=(3.0, 0.0, 0.0))
+    strained = world.edge(81, 5, 0, EdgeKind.LOOP, off=(0.12, 0.0, 0.0))
     with monkeypatch.context() as patch:
         patch.setattr(smoother.Smoother, "update", give_up_later)
         with pytest.raises(GraphError, match="cannot be solved with this change"):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from factors import EdgeKind, UncertainPose, VertexId
 from factors.sighting import Sighting
-from frontend.local_map import Grid
+from frontend.local_map import Bends, Grid
 from mrtm.team import records, session_file
 from mrtm.team.checks import RecordError, check_name
 from mrtm.team.records import (
@@ -117,6 +117,13 @@ BAD: list[tuple[Callable[..., None], dict[str, Any], str]] = [
     (local_map, {"cloud": np.array([[2e6, 0.0]])}, "cloud"),
     (local_map, {"normals": np.zeros((2, 2))}, "normals"),
     (local_map, {"normals": np.array([[0.5, 0.0]])}, "normal"),
+    (local_map, {"bends": Bends(np.zeros((65, 2)), np.zeros((65, 3, 3)))}, "number of places"),
+    (local_map, {"bends": Bends(np.zeros((1, 3)), COVARIANCE[None])}, "places"),
+    (local_map, {"bends": Bends(np.full((1, 2), math.nan), COVARIANCE[None])}, "places"),
+    (local_map, {"bends": Bends(np.zeros((2, 2)), COVARIANCE[None])}, "covariances of places"),
+    (local_map, {"bends": Bends(np.zeros((1, 2)), np.full((1, 3, 3), math.inf))}, "covariances of places"),
+    (local_map, {"bends": Bends(np.zeros((1, 2)), np.triu(np.ones((1, 3, 3))))}, "symmetric"),
+    (local_map, {"bends": Bends(np.zeros((1, 2)), -COVARIANCE[None])}, "eigenvalues"),
 ]
 
 

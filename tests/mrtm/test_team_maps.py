@@ -114,8 +114,6 @@ def test_free_space_stays_free_when_a_map_has_travelled() -> None:
             counts = [int(np.count_nonzero(s.lookup.kinds == kind)) for s in (kept, fresh)]
             assert counts[0] == pytest.approx(counts[1], rel=0.02)
             assert counts[0] > 1000
-        assert kept.width == pytest.approx(fresh.width, rel=0.2)
-        assert kept.width > 1.0
 
 
 def test_maps_make_what_sightings_began_exact() -> None:

@@ -1,11 +1,11 @@
 """Local maps of made-up walls, as alignment takes them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from frontend import se2
-from frontend.local_map import Grid
+from frontend.local_map import Bends, Grid
 from frontend.records import FloatArray
 from mrtm.joint.surface import Surface
 
@@ -20,6 +20,7 @@ class Made:
     grid: Grid
     cloud: FloatArray
     normals: FloatArray
+    bends: Bends = field(default_factory=Bends)
 
 
 def seen(walls: list[Wall], frame: FloatArray, low: float, high: float, seed: int, noise: float = 0.008) -> Surface:

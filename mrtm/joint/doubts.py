@@ -1,0 +1,201 @@
+"""Which edges that may be false a graph believes: one way in and one way out for loops, fusing and alignment edges.
+
+An edge that says what the estimate says already is believed. So is one that its uncertainty explains, where the
+estimate is sure enough to tell a true edge from a false one; any other is doubted: it is known, and without effect. It
+is judged again when the estimate has come nearer. Several doubted edges that agree with each other come in together,
+if they strain nothing that cannot be false, and put out those fewer ones that they contradict. Whatever believed edge
+the estimate then contradicts is doubted again.
+
+The work for a change is bounded, however many edges there are.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Sequence
+from itertools import islice
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from factors import FULL_WEIGHT, EdgeId, EdgeKind, GraphEdge
+from factors.noise import FloatArray
+from mrtm.joint.agreeing import agreeing, clique
+from mrtm.joint.equations import CERTAIN, Equations
+from mrtm.joint.pairs import LEAST_SUPPORT, outnumbers
+
+GATE = {2: 26.99, 3: 30.0}
+"""chi2 of so many degrees of freedom that a true edge has at most: one in 720,000 has more. Loops of real logs need
+that of three, as their errors have heavier tails than they claim."""
+
+ALLOWED = 0.001
+"""Chance that an edge which comes in by itself is false: that it was, by the share of those that are doubted, and that
+the estimate explains it none the less."""
+
+PRIOR = 0.002
+"""False edges met before the first: robots look twice before they close a loop or align two maps."""
+
+DISTINCT = 0.01
+"""Two edges agree where fewer than this share of random false ones would do so with either."""
+
+CHECKED = 64  # believed edges, and doubted ones, that a change has looked at beside the new ones
+LOOKED = 128  # doubted edges that a new doubted one is held against, the latest
+ROUNDS = 8  # of edges that come in and go out after a change, beside the new ones
+NEARER = 0.5  # of the chi2 that a doubted edge had when it was judged, for it to be judged again
+
+_FALSE_AREA = math.pi * 10.0**2
+
+
+class Doubts:
+    """The memory of one graph's doubts: which doubted edges agree, and which others are to be looked at next."""
+
+    def __init__(self) -> None:
+        self._agreeing: defaultdict[EdgeId, set[EdgeId]] = defaultdict(set)
+        self._next = 0  # place among all edges of the next believed one to be checked
+
+    def settle(self, equations: Equations, new: Collection[EdgeId]) -> None:
+        """Bring a graph that has changed to rest: let in, and put out, until nothing is due.
+
+        Args:
+            new: edges just added, which are doubted so far.
+        """
+        suspects = self._suspects(equations)
+        went_before: set[EdgeId] = set()
+        unseen = 1  # of the doubted ones, to be looked at before the graph is at rest
+        for _ in range(ROUNDS + len(new)):
+            if unseen <= 0:
+                return
+            again = list(islice((i for i in equations.doubted if i not in new), CHECKED))
+            for i in again:  # to the end of the queue
+                equations.doubted[i] = equations.doubted.pop(i)
+            unseen -= CHECKED
+            waiting = [i for i in (*new, *again) if i in equations.doubted and i not in went_before]
+            came = self._let_in(equations, waiting)
+            if not came:
+                came = self._let_in_together(equations, [i for i in new if i in waiting])
+            went = self._put_out(equations, suspects + came)
+            went_before |= {*went}
+            if came or went:
+                unseen = len(equations.doubted) + 1
+
+    def _let_in(self, equations: Equations, waiting: Sequence[EdgeId]) -> list[EdgeId]:
+        """All that the estimate agrees with, or else the first one that its uncertainty explains."""
+        misfits = {i: equations.misfit(equations.edges[i]) for i in waiting}
+        near = [i for i, chi2 in misfits.items() if chi2 <= FULL_WEIGHT[len(equations.edges[i].covariance)]]
+        if near:
+            equations.believe(near)
+            return near
+        for i, chi2 in misfits.items():
+            if chi2 < NEARER * equations.doubted[i]:
+                equations.doubted[i] = chi2
+                if _is_told_true(equations, equations.edges[i]):
+                    # At its full weight first: the kernel, which does not know of the drift, would hold it off.
+                    equations.believe([i], kernel=False)
+                    equations.put_under_kernel([i])
+                    return [i]
+        return []
+
+    def _let_in_together(self, equations: Equations, new: Iterable[EdgeId]) -> list[EdgeId]:
+        """The first set of edges around a new one that agree with each other and with what cannot be false."""
+        for i in new:
+            others = [j for j in islice(reversed(equations.doubted), LOOKED) if j != i]
+            for j in agreeing(equations, i, others, _agree):
+                self._agreeing[i].add(j)
+                self._agreeing[j].add(i)
+            members = clique(i, self._agreeing, equations.doubted)
+            if len(members) >= LEAST_SUPPORT and (went := _contradicted(equations, members)) is not None:
+                return [*members, *went]
+        return []
+
+    def _put_out(self, equations: Equations, suspects: Iterable[EdgeId]) -> list[EdgeId]:
+        """Of some edges the one that the estimate contradicts most."""
+        worst, most = None, 1.0
+        for i in suspects:
+            edge = equations.edges[i]
+            strain = 0.0 if i in equations.doubted else equations.misfit(edge) / GATE[len(edge.covariance)]
+            if strain > most and equations.may_go([i]):
+                worst, most = i, strain
+        if worst is None:
+            return []
+        equations.doubt([worst])
+        return [worst]
+
+    def _suspects(self, equations: Equations) -> list[EdgeId]:
+        """The next of all edges that may be false."""
+        if self._next >= len(equations.edges):
+            self._next = 0
+        chosen = islice(equations.edges.items(), self._next, self._next + CHECKED)
+        self._next += CHECKED
+        return [i for i, edge in chosen if edge.kind not in CERTAIN]
+
+
+def chance(covariance: FloatArray) -> float:
+    """Share of random false edges that would pass the gate, given the (n, n) covariance of their innovation.
+
+    The volume of the gate over that of where they may lie.
+    """
+    n = len(covariance)
+    ball = math.pi * GATE[2] if n == 2 else 4.0 / 3.0 * math.pi * GATE[3] ** 1.5 / (2.0 * math.pi)
+    return ball * math.sqrt(max(0.0, float(np.linalg.det(covariance)))) / _FALSE_AREA
+
+
+def _agree(chi2: float, covariance: FloatArray) -> bool:
+    return chi2 <= GATE[len(covariance)] and chance(covariance) < DISTINCT
+
+
+def _is_told_true(equations: Equations, edge: GraphEdge) -> bool:
+    """Whether the estimate explains an edge, and would hardly explain a false one.
+
+    What sightings fuse to was chosen among all others with the same care (``consistency``).
+    """
+    chi2, covariance = equations.innovation(edge)
+    if chi2 > GATE[len(covariance)]:
+        return False
+    passing = 0.0 if edge.kind in (EdgeKind.FUSING, EdgeKind.SIGHTING) else chance(covariance)
+    return passing < ALLOWED or passing * _share_of_false(equations) < ALLOWED
+
+
+def _share_of_false(equations: Equations) -> float:
+    """Of the edges that may be false; the one that is being judged is among the doubted ones and does not count."""
+    count = sum(edge.kind not in CERTAIN for edge in equations.edges.values())
+    judged = sum(chi2 < math.inf for chi2 in equations.doubted.values())
+    return (PRIOR + judged - 1) / count
+
+
+def _contradicted(equations: Equations, members: Sequence[EdgeId]) -> list[EdgeId] | None:
+    """Let edges in at once and put out those they contradict, which are returned; None if it cannot be, and all is as
+    it was.
+
+    They must be clearly more than those that go, and may strain what stays no more than true ones would.
+    """
+    before = equations.cost()
+    equations.believe(members, kernel=False)
+    went = [i for i in _strained(equations) if i not in members]
+    may = outnumbers(len(members), len(went)) if went else True
+    if may and went and (may := equations.may_go(went)):
+        equations.doubt([*members, *went])
+        before = equations.cost()
+        equations.believe(members, kernel=False)
+    if may and not _strained(equations) and equations.cost() - before <= _set_gate(len(members)):
+        equations.put_under_kernel(members)
+        return went
+    equations.doubt(members)
+    again = [i for i in went if i in equations.doubted]
+    if again:
+        equations.believe(again)
+    return None
+
+
+def _strained(equations: Equations) -> list[EdgeId]:
+    """Believed edges that may be false and that the estimate contradicts."""
+    return [
+        i
+        for i, edge in equations.edges.items()
+        if edge.kind not in CERTAIN
+        and i not in equations.doubted
+        and equations.misfit(edge) > GATE[len(edge.covariance)]
+    ]
+
+
+def _set_gate(count: int) -> float:
+    """What so many true edges add to the least sum of squares at most, more as seldom as one alone beyond its gate."""
+    return float(chdtri(3 * count, chdtrc(3, GATE[3])))
