@@ -52,10 +52,10 @@ class TopologyParameters(Section):
         float,
         Parameter(
             "",
-            "chi2 of a re-entry against the joint map above which it is refused; more where the place stands out",
+            "chi2 of a re-entry against the joint map above which it is refused (99 %); more where the place stands out",
             gt=0,
         ),
-    ] = 24.0
+    ] = 11.34
     trial_lead: Annotated[float, Parameter("", "by which one place must beat all others", ge=0, le=1)] = 0.05
 
 
