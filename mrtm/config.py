@@ -52,7 +52,7 @@ class TopologyParameters(Section):
         float,
         Parameter(
             "",
-            "chi2 of a re-entry against the joint map above which it is refused (99 %); more where the place stands out",
+            "chi2 of a re-entry against the joint map that refuses it (99 %); more where the place stands out",
             gt=0,
         ),
     ] = 11.34
