@@ -23,7 +23,7 @@ SETTLED = 0.02  # metres: no further round if no pose moved more
 LEASH = np.diag([1.0 / 0.05**2, 1.0 / 0.05**2, 1.0 / 0.03**2])  # information that keeps a match near where it starts
 TAIL = 9.0  # squared Mahalanobis distance at which odometry has half its weight
 SMOOTHING_STEPS = 3  # Gauss-Newton steps
-OBJECTION = 1.0  # log-likelihood of the scans, as the filter weighs them, that the way back must not cost
+OBJECTION = 1.0  # log-likelihood of the scans, as the filter weighs them, that being tracked back must not cost
 DRAW_DISTANCE = 0.10  # metres or
 DRAW_ANGLE = 0.10  # radians between the scans that the map is drawn from
 
@@ -255,18 +255,26 @@ def _tracked_back(
     known: Maps, packed: _Packed, poses: FloatArray, increments: FloatArray, variances: FloatArray,
     parameters: FilterParameters,
 ) -> FloatArray:  # fmt: skip
-    """Poses (n, 3) in a known map, from the last of them back along odometry to the first, unless the map objects.
+    """Poses (n, 3) in a known map, from the last of them back along odometry to the first, if that is likelier.
 
     A robot that comes in by where the map knows only one wall takes itself to be anywhere along it, preferably where
     more of what it sees is known. It jumps or slides to its place when it sees more; from there the way back is plain.
+    Odometry alone, which may lie, does not decide: the scans must fit as well.
     """
     back = poses.copy()
     _track_back(
         known.log_odds[0], known.index[0], known.surfels[0], known.resolution,
         packed.hits, packed.ends, back, increments, variances, parameters.sigma,
     )  # fmt: skip
-    (_, _, before), (_, _, after) = (_matches(known, packed, p, parameters) for p in (poses, back))
-    return back if parameters.independence * (after.sum() - before.sum()) > -OBJECTION else poses
+    ways = [_matched(known, packed, p, increments, variances, parameters) for p in (poses, back)]
+    scans, odometry = np.empty(2), np.empty(2)  # log-likelihoods, as the filter weighs a particle
+    for i, way in enumerate(ways):
+        _, _, of_scans = _matches(known, packed, way, parameters)
+        off = se2.between(se2.compose(way[:-1], increments[1:]), way[1:])
+        scans[i] = parameters.independence * of_scans.sum()
+        odometry[i] = -0.5 * TAIL * np.log1p((off**2 / variances[1:]).sum(axis=1) / TAIL).sum()
+    likelier = scans[1] + odometry[1] > scans[0] + odometry[0]
+    return ways[1] if likelier and scans[1] > scans[0] - OBJECTION else ways[0]
 
 
 def _matched(
