@@ -23,22 +23,37 @@ SETTLED = 0.02  # metres: no further round if no pose moved more
 LEASH = np.diag([1.0 / 0.05**2, 1.0 / 0.05**2, 1.0 / 0.03**2])  # information that keeps a match near where it starts
 TAIL = 9.0  # squared Mahalanobis distance at which odometry has half its weight
 SMOOTHING_STEPS = 3  # Gauss-Newton steps
-JUMP, JUMP_CHI2 = 0.1, 30.0  # metres, and squared Mahalanobis distance, from odometry that make a jump
-TOLERANCE = 0.03  # fit that a path may lose by having no jump
+OBJECTION = 1.0  # log-likelihood of the scans, as the filter weighs them, that being tracked back must not cost
 DRAW_DISTANCE = 0.10  # metres or
 DRAW_ANGLE = 0.10  # radians between the scans that the map is drawn from
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _match_all(log_odds, index, surfels, resolution, hits, ends, poses, information, sigma, hessians, fits):  # type: ignore[no-untyped-def]  # fmt: skip
+def _match_all(log_odds, index, surfels, resolution, hits, ends, poses, information, sigma, hessians, log_likelihoods):  # type: ignore[no-untyped-def]  # fmt: skip
     for i in prange(len(poses)):
         first = ends[i - 1] if i else 0
         scan = hits[first : ends[i]]
         prior = poses[i].copy()
-        fit, near, free, _ = match(
+        _, _, _, log_likelihoods[i] = match(
             log_odds, index, surfels, resolution, scan, poses[i], prior, information, sigma, hessians[i]
-        )  # fmt: skip
-        fits[i] = fit / max(1, near + free)
+        )
+
+
+@njit(cache=True, nogil=True)
+def _track_back(log_odds, index, surfels, resolution, hits, ends, poses, increments, variances, sigma):  # type: ignore[no-untyped-def]
+    """Replace every pose but the last by the best match about where odometry has it, seen from the one after it."""
+    information, hessian = np.zeros((3, 3)), np.empty((3, 3))
+    for i in range(len(poses) - 2, -1, -1):
+        theta = poses[i + 1, 2] - increments[i + 1, 2]
+        c = math.cos(theta)
+        s = math.sin(theta)
+        poses[i, 0] = poses[i + 1, 0] - c * increments[i + 1, 0] + s * increments[i + 1, 1]
+        poses[i, 1] = poses[i + 1, 1] - s * increments[i + 1, 0] - c * increments[i + 1, 1]
+        poses[i, 2] = theta
+        for k in range(3):
+            information[k, k] = 1.0 / variances[i + 1, k]
+        scan = hits[ends[i - 1] if i else 0 : ends[i]]
+        match(log_odds, index, surfels, resolution, scan, poses[i], poses[i].copy(), information, sigma, hessian)
 
 
 @njit(cache=True, nogil=True)
@@ -214,7 +229,7 @@ def localise(
 ) -> Adjusted:  # fmt: skip
     """Better poses for scans in a ``known`` map (a stack of one), which stays as it is; else as ``refine``."""
     packed = _Packed(points)
-    poses = _without_jumps(known, packed, poses, increments, variances, parameters)
+    poses = _tracked_back(known, packed, poses, increments, variances, parameters)
     for _ in range(ROUNDS):
         before = poses
         poses = _matched(known, packed, poses, increments, variances, parameters)
@@ -227,34 +242,39 @@ def localise(
 def _matches(
     maps: Maps, packed: _Packed, poses: FloatArray, parameters: FilterParameters
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The first n scans against the map: poses (n, 3), their informations (n, 3, 3) and fits (n,)."""
-    matched, hessians, fits = poses.copy(), np.empty((len(poses), 3, 3)), np.empty(len(poses))
+    """The first n scans against the map: poses (n, 3), their informations (n, 3, 3) and log-likelihoods (n,)."""
+    matched, hessians, log_likelihoods = poses.copy(), np.empty((len(poses), 3, 3)), np.empty(len(poses))
     _match_all(
         maps.log_odds[0], maps.index[0], maps.surfels[0], maps.resolution,
-        packed.hits, packed.ends, matched, LEASH, parameters.sigma, hessians, fits,
+        packed.hits, packed.ends, matched, LEASH, parameters.sigma, hessians, log_likelihoods,
     )  # fmt: skip
-    return matched, hessians, fits
+    return matched, hessians, log_likelihoods
 
 
-def _without_jumps(
+def _tracked_back(
     known: Maps, packed: _Packed, poses: FloatArray, increments: FloatArray, variances: FloatArray,
     parameters: FilterParameters,
 ) -> FloatArray:  # fmt: skip
-    """Poses (n, 3) in a known map without the jumps of a robot that at first took itself to be a little off.
+    """Poses (n, 3) in a known map, from the last of them back along odometry to the first, if that is likelier.
 
-    The part before a jump is moved to where odometry has it, seen from the part after it, unless the map objects.
+    A robot that comes in by where the map knows only one wall takes itself to be anywhere along it, preferably where
+    more of what it sees is known. It jumps or slides to its place when it sees more; from there the way back is plain.
+    Odometry alone, which may lie, does not decide: the scans must fit as well.
     """
-    off = se2.between(se2.compose(poses[:-1], increments[1:]), poses[1:])
-    doubtful = (np.hypot(off[:, 0], off[:, 1]) > JUMP) & ((off**2 / variances[1:]).sum(axis=1) > JUMP_CHI2)
-    for last in np.flatnonzero(doubtful)[::-1]:
-        part = poses[: last + 1]
-        moved = se2.compose(
-            se2.compose(poses[last + 1], se2.inverse(increments[last + 1])), se2.between(part[-1], part)
-        )
-        (_, _, before), (found, _, after) = (_matches(known, packed, p, parameters) for p in (part, moved))
-        if after.mean() > before.mean() - TOLERANCE:
-            poses = np.concatenate([found, poses[last + 1 :]])
-    return poses
+    back = poses.copy()
+    _track_back(
+        known.log_odds[0], known.index[0], known.surfels[0], known.resolution,
+        packed.hits, packed.ends, back, increments, variances, parameters.sigma,
+    )  # fmt: skip
+    ways = [_matched(known, packed, p, increments, variances, parameters) for p in (poses, back)]
+    scans, odometry = np.empty(2), np.empty(2)  # log-likelihoods, as the filter weighs a particle
+    for i, way in enumerate(ways):
+        _, _, of_scans = _matches(known, packed, way, parameters)
+        off = se2.between(se2.compose(way[:-1], increments[1:]), way[1:])
+        scans[i] = parameters.independence * of_scans.sum()
+        odometry[i] = -0.5 * TAIL * np.log1p((off**2 / variances[1:]).sum(axis=1) / TAIL).sum()
+    likelier = scans[1] + odometry[1] > scans[0] + odometry[0]
+    return ways[1] if likelier and scans[1] > scans[0] - OBJECTION else ways[0]
 
 
 def _matched(

@@ -25,7 +25,10 @@ class TopologyParameters(Section):
         Literal["joint", "dijkstra"],
         Parameter("", "where M6 takes the pose in a known vertex from: joint estimate or shortest path", "dijkstra"),
     ] = "joint"
-    omega: Annotated[float, Parameter("", "weight of the new estimate in M5", paper="0.5", ge=0, le=1)] = 0.5
+    omega: Annotated[
+        float | Literal["optimal"],
+        Parameter("", "weight of the new estimate in M5; optimal: the least covariance", paper="0.5", ge=0, le=1),
+    ] = "optimal"
     reach: Annotated[
         float, Parameter("", "standard deviations a pose may lie outside a square in M6", paper="0", ge=0)
     ] = 2.0
@@ -49,10 +52,10 @@ class TopologyParameters(Section):
         float,
         Parameter(
             "",
-            "chi2 of a re-entry against the joint map above which it is refused; more where the place stands out",
+            "chi2 of a re-entry against the joint map that refuses it (99 %); more where the place stands out",
             gt=0,
         ),
-    ] = 24.0
+    ] = 11.34
     trial_lead: Annotated[float, Parameter("", "by which one place must beat all others", ge=0, le=1)] = 0.05
 
 
@@ -98,7 +101,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # square keeps the text's proportion to the map.
     "paper": {
         "frontend": {"particles": 40, "sensing_range": 10.0, "map_width": 20.0, "travel_square": 10.0},
-        "topology": {"projection": "dijkstra"},
+        "topology": {"projection": "dijkstra", "omega": 0.5},
         "joint": {"alignments": 0},
     },
 }
@@ -215,12 +218,16 @@ def _read(file: Path) -> Mapping[Any, Any]:
 
 def _explain(error: ValidationError, given: Mapping[str, _Given]) -> str:
     """The first error in one line: who gave which value to which key, and what it must be."""
-    first = error.errors()[0]
+    errors = error.errors()
+    first = errors[0]
     path = [str(part) for part in first["loc"]]
     cause = first.get("ctx", {}).get("error")
     if isinstance(cause, ParameterError):
         key, complaint = ".".join([*path, cause.name]), cause.complaint
     else:
-        key, complaint = ".".join(path), first["msg"].replace("Input should", "must", 1)
+        # Of a value that may be of several types there is an error for each, its path ending with the type.
+        key = ".".join(path if ".".join(path) in _TYPES else path[:-1])
+        same = [e["msg"] for e in errors if ".".join(map(str, e["loc"])).startswith(key)]
+        complaint = " or ".join(same).replace("Input should", "must", 1).replace("Input should ", "")
     item = given.get(key) or _Given(first.get("input"), "configuration")
     return f"{item.source}: {key} is {shorten(repr(item.value))}: {complaint}"

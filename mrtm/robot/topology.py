@@ -48,8 +48,9 @@ class Vertex:
     def uncertain(self, pose: FloatArray, covariance: FloatArray) -> UncertainPose:
         """A pose (3,) known to ``covariance`` (3, 3) in the map, with the map's own error as seen from it added.
 
-        What is seen was drawn from all the poses the map was made from: their covariances, carried here, are averaged,
-        the nearer ones counting more.
+        What is seen was drawn from all the poses the map was made from: their errors, carried here, are averaged, the
+        nearer ones counting more, and taken to go together. Averaging the covariances would say more than the largest
+        that this average can have.
         """
         if not len(self.places):
             return UncertainPose(pose_of(pose), covariance)
@@ -62,7 +63,10 @@ class Vertex:
         adjoint[:, 2, 2] = 1.0
         weights = 1.0 / (NEAR**2 + (here_T_place[:, :2] ** 2).sum(axis=1)) ** 2
         carried = adjoint @ self.covariances @ np.transpose(adjoint, (0, 2, 1))
-        return UncertainPose(pose_of(pose), covariance + np.average(carried, axis=0, weights=weights))
+        variances, axes = np.linalg.eigh(carried)
+        roots = (axes * np.sqrt(np.maximum(variances, 0.0))[:, None, :]) @ np.transpose(axes, (0, 2, 1))
+        root = np.average(roots, axis=0, weights=weights)
+        return UncertainPose(pose_of(pose), covariance + root @ root)
 
 
 class Topology:

@@ -141,26 +141,43 @@ def test_a_visit_of_one_scan(hits: int) -> None:
     np.testing.assert_array_equal(maps.log_odds, drawn([few], at).log_odds)
 
 
-def jumping(odometry_lies: bool) -> tuple[FloatArray, FloatArray]:
-    """True poses in the known room; the path found if its first ten poses are 0.31 m off, or odometry once is."""
-    base = room()[2]
-    log, points, increments = drive()
-    true, increments = log.poses[:40], np.vstack([np.zeros(3), se2.between(log.poses[:39], log.poses[1:40])])
+def tracked_back(
+    points: list[Points], path: FloatArray, increments: FloatArray, known: Maps | None = None
+) -> FloatArray:
+    """The path (n, 3) in the known room, tracked back."""
     variances = np.array([motion.variance(i, PARAMETERS.motion) for i in increments])
-    path = true.copy()
-    if odometry_lies:
-        increments[10] += [0.31, 0.0, 0.0]
-    else:
-        path[:10] = se2.compose(np.array([0.2, -0.24, 0.0]), path[:10])
-    packed = refine._Packed(points[:40])
-    return true, refine._without_jumps(base, packed, path, increments, variances, PARAMETERS)
+    packed = refine._Packed(points)
+    return refine._tracked_back(known or room()[2], packed, path, increments, variances, PARAMETERS)
+
+
+def known_visit() -> tuple[list[Points], FloatArray, FloatArray]:
+    """40 scans in the room, their true poses, and odometry without error."""
+    log, points, _ = drive()
+    true = log.poses[:40]
+    return points[:40], true, np.vstack([np.zeros(3), se2.between(true[:-1], true[1:])])
 
 
 def test_a_jump_in_a_known_map_is_taken_out() -> None:
-    true, path = jumping(odometry_lies=False)
-    assert np.abs(path - true)[:, :2].max() < 0.03
+    points, true, increments = known_visit()
+    path = true.copy()
+    path[:10] = se2.compose(np.array([0.2, -0.24, 0.0]), path[:10])
+    assert np.abs(tracked_back(points, path, increments) - true)[:, :2].max() < 0.03
 
 
-def test_a_jump_of_odometry_is_not_taken_into_the_path() -> None:
-    true, path = jumping(odometry_lies=True)
-    np.testing.assert_array_equal(path, true)
+def test_a_slip_along_the_only_wall_in_sight_is_taken_out() -> None:
+    """Slow enough to be no jump; the map explains every pose on the way."""
+    points, true, increments = known_visit()
+    for i in range(25):
+        y = true[i, 1] + points[i].hits[:, :2] @ [math.sin(true[i, 2]), math.cos(true[i, 2])]
+        wall = np.abs(y - y.max()) < 0.1
+        points[i] = Points(points[i].hits[wall], points[i].clear, points[i].sensor)
+    path = true.copy()
+    path[:30, 0] += 0.3 * np.minimum(1.0, (30 - np.arange(30)) / 8.0)
+    assert np.abs(tracked_back(points, path, increments) - true)[:, :2].max() < 0.04
+
+
+def test_where_odometry_lies_the_path_stays() -> None:
+    """A wheel that spun: what it says is in no direction where the map has nothing to say."""
+    points, true, increments = known_visit()
+    increments[10] += [0.31, 0.0, 0.0]
+    assert np.abs(tracked_back(points, true, increments) - true)[:, :2].max() < 0.03

@@ -70,6 +70,9 @@ def test_every_parameter_says_what_it_is() -> None:
         ("frontend.motion.xy_floor=0", "frontend.motion.xy_floor is 0: must be at least 1e-05 m"),
         ("frontend=3", "frontend is a section and cannot be 3"),
         ("topology.projection=maybe", "topology.projection is 'maybe': must be 'joint' or 'dijkstra'"),
+        ("topology.omega=often", "topology.omega is 'often': must be a valid number, unable to parse"),
+        ("topology.omega=[1]", "topology.omega is [1]: must be a valid number or be 'optimal'"),
+        ("topology.omega=2", "topology.omega is 2: must be at most 1"),
         ("topology.projection=true", "topology.projection is true: must not be true or false"),
         (
             "frontend.map_width=1e6",

@@ -198,3 +198,8 @@ def test_the_error_of_a_map_is_that_of_the_poses_it_was_made_from() -> None:
     vertex.drawn_from(np.array([[5.5, 0.5, 1.0], [12.0, 0.0, 0.0]]), np.stack([np.eye(3), 2.0 * np.eye(3)]))
     np.testing.assert_array_equal(vertex.places, [*before, [12.0, 0.0, 0.0]])
     np.testing.assert_array_equal(vertex.covariances[-1], 2.0 * np.eye(3))
+    # Errors are averaged, not their squares: beside a pose without error, half an error is a quarter of its square.
+    vertex.places = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+    vertex.covariances = np.stack([np.zeros((3, 3)), np.diag([4e-4, 1e-4, 0.0])])
+    half = vertex.uncertain(np.array([5.0, 0.0, 0.0]), own).covariance - own
+    np.testing.assert_allclose(half, np.diag([1e-4, 0.25e-4, 0.0]), atol=1e-12)
