@@ -39,8 +39,10 @@ class GraphError(ValueError):
 class JointGraph:
     """One connected component, solved: after every ``update`` the estimate is the optimum.
 
-    To 2e-5 m and rad, that is; of more than a thousand vertices to about 1 cm, since to linearise all of them anew at
-    every loop is what makes others wait. ``optimize_fully`` gets the last digit.
+    To 2e-5 m and rad, that is. Of more than a thousand vertices a part that has turned by less than 5 mrad is not
+    linearised anew, and of more the updates that only add vertices take a portion each, so that none makes others wait:
+    the estimate stays within about 1 cm of the optimum, and comes back to that within some twenty updates where a loop
+    has turned thousands of vertices (8 cm at most meanwhile, on M3500). ``optimize_fully`` gets the last digit.
 
     The root's pose is fixed by a prior (M1); the frame in which it has that pose is the joint frame. Every other
     vertex is connected to the root by edges that fix a pose, always: a range and bearing adds to what is known of
@@ -263,8 +265,9 @@ class JointGraph:
         for vertex in gone:
             if self._key(vertex) == 0:
                 raise GraphError(f"vertex {vertex} is the root and cannot be removed")
-        for edge_id in removed - self._edges.keys():
-            raise GraphError(f"edge {edge_id} cannot be removed: it is not in the joint graph")
+        for edge_id in removed:  # a difference of sets would look at every edge of the graph
+            if edge_id not in self._edges:
+                raise GraphError(f"edge {edge_id} cannot be removed: it is not in the joint graph")
         if gone:
             removed |= {e.id for e in self._edges.values() if e.tail in gone or e.head in gone}
             self._keys = {v: k for v, k in self._keys.items() if v not in gone}
@@ -337,6 +340,7 @@ class JointGraph:
             start = {i: without_kernel(f) if i in eager else f for i, f in late.items()}
             self._smoother.update(start, gtsam.Values(), ())
             if eager:
+                self._smoother.settle()  # a kernel is to weigh the optimum, not the first step towards it
                 self._smoother.update({i: late[i] for i in eager}, gtsam.Values(), eager)
 
     def _is_explained(self, edge: GraphEdge) -> bool:
