@@ -39,10 +39,10 @@ class GraphError(ValueError):
 class JointGraph:
     """One connected component, solved: after every ``update`` the estimate is the optimum.
 
-    To 2e-5 m and rad, that is. Of more than a thousand vertices a part that has turned by less than 5 mrad is not
-    linearised anew, and of more the updates that only add vertices take a portion each, so that none makes others wait:
-    the estimate stays within about 1 cm of the optimum, and comes back to that within some twenty updates where a loop
-    has turned thousands of vertices (8 cm at most meanwhile, on M3500). ``optimize_fully`` gets the last digit.
+    To 2e-5 m and rad, that is. Of more than a thousand vertices those that have turned by less than 5 mrad are not
+    linearised anew, and of those that have turned further each update takes a portion, so that none makes others wait.
+    The estimate stays about 1 cm from the optimum; where a loop turns thousands of vertices it may be some centimetres,
+    for a few dozen updates (M3500: 6 cm after the worst loop). ``optimize_fully`` gets the last digit.
 
     The root's pose is fixed by a prior (M1); the frame in which it has that pose is the joint frame. Every other
     vertex is connected to the root by edges that fix a pose, always: a range and bearing adds to what is known of

@@ -38,8 +38,8 @@ _EXACT = _Tolerance(1e-4, 1e-5)
 # Of a large graph only what ``relinearization`` has chosen is linearised anew.
 _COARSE = _Tolerance(1e-4, 1e-3)
 _LARGE = 1000  # variables
-_PORTION = 250  # variables that one update of a large graph linearises anew, unless it has more new factors itself
-_PATIENCE = 5  # updates in a row that may leave that to the next
+_PORTION = 100  # variables that one update of a large graph linearises anew, unless it has more new factors itself
+_PATIENCE = 5  # updates before the next portion, of those that only add vertices; of others twice as many
 
 _MAX_STEPS = 30
 _NEVER = 2**31 - 1  # updates
@@ -76,6 +76,7 @@ class Smoother:
         self._values: gtsam.Values | None = None
         self._seen_from: dict[int, gtsam.ISAM2] = {}
         self._waited = 0  # updates since one that linearised a portion anew
+        self._behind = False  # whether that left some for the next
         self._start(factors, values)
 
     def update(
@@ -94,7 +95,8 @@ class Smoother:
         after a large loop: to linearise anew what that has turned is the work of the next updates (``refine``).
         """
         still = len(add) == values.size() and not remove  # each new key is where its only factor has it
-        due = still or self._waited == _PATIENCE
+        patience = 0 if self._behind else _PATIENCE
+        due = self._waited >= (patience if still else 2 * _PATIENCE)
         self._waited = 0 if due else self._waited + 1
         self._solve(lambda: self._insert(add, values, remove, _PORTION if due else 0))
         if self._tolerance is not _tolerance(self._size):
@@ -231,6 +233,10 @@ class Smoother:
         change = gtsam.ISAM2UpdateParams()
         change.removeFactorIndices = [self._slots[edge_id] for edge_id in remove]
         self._choose(change, weighed, most)
+        if self._tolerance is _COARSE and len(add) == 1:  # at the top of the tree the newest end, and not the old one
+            top = gtsam.KeyGroupMap()
+            top.insert2(max(next(iter(add.values())).keys()), 1)
+            change.constrainedKeys = top
         result = self._isam.update(graph, values, change)
         new = dict(zip(add, result.getNewFactorsIndices(), strict=True))
         if (most := max(new.values(), default=0)) >= len(self._kernels):  # doubled: a slot more costs nothing
@@ -261,7 +267,9 @@ class Smoother:
         chosen = np.isin(keys, weighed)
         if most:
             kernels = np.searchsorted(keys, self._kernels[self._kernels[:, 0] != _NONE])
-            chosen[portion(lambda: gtsam.utilities.extractPose2(point), moved, kernels, most)] = True
+            rows = portion(lambda: gtsam.utilities.extractPose2(point), moved, kernels, most)
+            chosen[rows] = True
+            self._behind = len(rows) == most
         if chosen.any():
             change.force_relinearize = True
             left = gtsam.KeyList()

@@ -26,7 +26,7 @@ from factors import (
     prior_factor,
     without_kernel,
 )
-from mrtm.joint import smoother
+from mrtm.joint import relinearization, smoother
 from mrtm.joint.graph import GraphError, JointGraph
 
 FloatArray = npt.NDArray[np.float64]
@@ -326,7 +326,7 @@ def test_a_large_graph_is_linearised_anew_in_portions(monkeypatch: pytest.Monkey
     """One loop turns most of a long chain: the next updates work that off, without one that takes it all."""
     monkeypatch.setattr(smoother, "_LARGE", 100)
     monkeypatch.setattr(smoother, "_PORTION", 30)
-    world, portions, plain = World(7, 220, turn=0.3), [], smoother.portion
+    world, portions, plain = World(7, 220, turn=0.3), [], relinearization.portion
 
     def remember(*asked: Any) -> Any:
         portions.append(len(plain(*asked)))

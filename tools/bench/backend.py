@@ -140,7 +140,8 @@ def backend_report(graphs: Sequence[tuple[PoseGraph, Sequence[Fed]]], setting: S
     """The table as Markdown."""
     lines = ["# The back end at scale", "", *([f"**{note}**", ""] if note else []), *setting.lines()]
     lines += [
-        "- a step is one edge: update, and the estimate of its pose; bare iSAM2 has GTSAM's default parameters",
+        "- a step is one edge: update, and the estimate of its pose; processor time; bare iSAM2 has GTSAM's default "
+        "parameters",
         "- cost is without kernels, for all alike; gap is the distance of the worst pose from the optimum of the edges "
         f"that are in, at the end and at the worst of {CHECKS} checks on the way",
         "",
