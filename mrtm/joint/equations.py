@@ -66,6 +66,8 @@ class Equations:
     def believe(self, ids: Collection[EdgeId], kernel: bool = True) -> None:
         """Let doubted edges in, at their full weight if not under their kernel."""
         self._smoother.update({i: self._factor(i, kernel) for i in ids}, gtsam.Values(), ())
+        if not kernel:
+            self._smoother.settle()  # a kernel that follows is to weigh the optimum, not the first step towards it
         for i in ids:
             del self.doubted[i]
 

@@ -13,7 +13,8 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from factors import EdgeId
+from factors import EdgeId, has_kernel
+from mrtm.joint.relinearization import portion
 
 FloatArray = npt.NDArray[np.float64]
 T = TypeVar("T")
@@ -34,12 +35,15 @@ class _Tolerance(NamedTuple):
 # The estimate is within about 2e-5 of the optimum.
 _EXACT = _Tolerance(1e-4, 1e-5)
 
-# To linearise a large graph anew at every loop makes the spikes that users feel. What is left here is of second order
-# in what the poses have moved: see ``python -m tools.benchmark --backend``.
-_COARSE = _Tolerance(0.03, 1e-3)
+# Of a large graph only what ``relinearization`` has chosen is linearised anew.
+_COARSE = _Tolerance(1e-4, 1e-3)
 _LARGE = 1000  # variables
+_PORTION = 100  # variables that one update of a large graph linearises anew, unless it has more new factors itself
+_PATIENCE = 5  # updates before the next portion, of those that only add vertices; of others twice as many
 
 _MAX_STEPS = 30
+_NEVER = 2**31 - 1  # updates
+_NONE = -1  # instead of a key
 
 # Factors in all the eliminations that are kept for further questions, seen from one pose each: about 10 kB a factor.
 _KEPT = 1_000
@@ -71,6 +75,8 @@ class Smoother:
         self._factorization = "CHOLESKY"
         self._values: gtsam.Values | None = None
         self._seen_from: dict[int, gtsam.ISAM2] = {}
+        self._waited = 0  # updates since one that linearised a portion anew
+        self._behind = False  # whether that left some for the next
         self._start(factors, values)
 
     def update(
@@ -85,19 +91,25 @@ class Smoother:
 
         An id may be in both: its factor is exchanged. A key that is left without a factor is gone.
 
-        Of a graph of more than a thousand keys the estimate may stay a centimetre from the optimum (``refine``).
+        Of a graph of more than a thousand keys the estimate may stay a centimetre from the optimum, and further right
+        after a large loop: to linearise anew what that has turned is the work of the next updates (``refine``).
         """
-        self._solve(lambda: self._insert(add, values, remove))
+        still = len(add) == values.size() and not remove  # each new key is where its only factor has it
+        patience = 0 if self._behind else _PATIENCE
+        due = self._waited >= (patience if still else 2 * _PATIENCE)
+        self._waited = 0 if due else self._waited + 1
+        self._solve(lambda: self._insert(add, values, remove, _PORTION if due else 0))
         if self._tolerance is not _tolerance(self._size):
             self._start(self._factors, self.values())
-        if len(add) == values.size() and not remove:
-            return  # each new key is where its only factor has it: nothing moves
-        exact = self._tolerance is _EXACT
-        for _ in range(_MAX_STEPS if exact else 1):  # where a second step is due, the next update begins with it
-            if self._solve(self._step) == 0:
+        if not still and (self._tolerance is _EXACT or len(add) > _PORTION):
+            self.settle()
+
+    def settle(self) -> None:
+        """Linearise anew until nothing is left to be."""
+        for _ in range(_MAX_STEPS):
+            if self._solve(lambda: self._insert({}, gtsam.Values(), (), None)) == 0:
                 return
-        if exact:
-            self.refine()
+        self.refine()
 
     def refine(self) -> None:
         """Levenberg-Marquardt over everything from the present estimate, then iSAM2 anew from there."""
@@ -184,7 +196,8 @@ class Smoother:
         rest.erase(root)
         self._size = 1
         self._slots: dict[EdgeId, int] = {}
-        self._insert(dict(factors), rest, ())
+        self._kernels = np.full((64, 2), _NONE)  # the ends of the factors that have one, by slot
+        self._insert(dict(factors), rest, (), 0)
 
     def _solve(self, step: Callable[[], T]) -> T:
         """What ``step`` returns; where Cholesky gives up in it, all is begun anew with QR and it is done again."""
@@ -205,28 +218,64 @@ class Smoother:
             raise
         self._factorization = "QR"
 
-    def _step(self) -> int:
-        """Linearise anew what has moved, and solve; the number of variables that had."""
-        self._values = None
-        return int(self._isam.update().getVariablesRelinearized())
-
     def _insert(
         self,
         add: Mapping[EdgeId, gtsam.NoiseModelFactor],
         values: gtsam.Values,
         remove: Collection[EdgeId],
-    ) -> None:
+        most: int | None,
+    ) -> int:
+        """One update of iSAM2; 0 if no variable had to be linearised anew, as at ``most`` of a large graph may be."""
         graph = gtsam.NonlinearFactorGraph()
         for factor in add.values():
             graph.push_back(factor)
-        result = self._isam.update(graph, values, [self._slots[edge_id] for edge_id in remove])
+        weighed = [factor.keys() for factor in add.values() if has_kernel(factor)]
+        change = gtsam.ISAM2UpdateParams()
+        change.removeFactorIndices = [self._slots[edge_id] for edge_id in remove]
+        self._choose(change, weighed, most)
+        if self._tolerance is _COARSE and len(add) == 1:  # at the top of the tree the newest end, and not the old one
+            top = gtsam.KeyGroupMap()
+            top.insert2(max(next(iter(add.values())).keys()), 1)
+            change.constrainedKeys = top
+        result = self._isam.update(graph, values, change)
+        new = dict(zip(add, result.getNewFactorsIndices(), strict=True))
+        if (most := max(new.values(), default=0)) >= len(self._kernels):  # doubled: a slot more costs nothing
+            self._kernels = np.concatenate([self._kernels, np.full((most + 1, 2), _NONE)])
         for edge_id in remove:
-            del self._factors[edge_id], self._slots[edge_id]
+            self._kernels[self._slots.pop(edge_id)] = _NONE
+            del self._factors[edge_id]
+        for edge_id, slot in new.items():
+            self._kernels[slot] = add[edge_id].keys() if has_kernel(add[edge_id]) else _NONE
         self._factors.update(add)
-        self._slots.update(zip(add, result.getNewFactorsIndices(), strict=True))
+        self._slots.update(new)
         self._size += values.size() - result.getUnusedKeys().size()
         self._values = None
         self._seen_from = {}
+        return int(result.getVariablesRelinearized())
+
+    def _choose(self, change: gtsam.ISAM2UpdateParams, weighed: list[list[int]], most: int | None) -> None:
+        """Say which variables ``change`` linearises anew: all that have moved; of a large graph ``most`` of them.
+
+        And there always the ends of the kernels that come with it, whose weight is to be that of the estimate.
+        """
+        change.force_relinearize = self._tolerance is _EXACT or most is None
+        if change.force_relinearize or not (most or weighed):
+            return
+        point = self._isam.getLinearizationPoint()
+        names = point.keys()
+        keys, moved = np.array(names), self._isam.getDelta().vector(names).reshape(-1, 3)
+        chosen = np.isin(keys, weighed)
+        if most:
+            kernels = np.searchsorted(keys, self._kernels[self._kernels[:, 0] != _NONE])
+            rows = portion(lambda: gtsam.utilities.extractPose2(point), moved, kernels, most)
+            chosen[rows] = True
+            self._behind = len(rows) == most
+        if chosen.any():
+            change.force_relinearize = True
+            left = gtsam.KeyList()
+            for key in keys[~chosen & (np.abs(moved).max(axis=1) >= self._tolerance.relinearize)].tolist():
+                left.push_back(key)
+            change.noRelinKeys = left
 
 
 def _tolerance(size: int) -> _Tolerance:
@@ -240,8 +289,7 @@ def _parameters(tolerance: _Tolerance, factorization: str) -> gtsam.ISAM2Params:
     params.setOptimizationParams(gauss_newton)
     params.setRelinearizeThreshold(tolerance.relinearize)
     params.setFactorization(factorization)
-    params.relinearizeSkip = 1
-    params.enablePartialRelinearizationCheck = tolerance is _COARSE
+    params.relinearizeSkip = _NEVER  # but where an update asks for it
     params.findUnusedFactorSlots = True
     return params
 

@@ -26,7 +26,7 @@ from factors import (
     prior_factor,
     without_kernel,
 )
-from mrtm.joint import smoother
+from mrtm.joint import relinearization, smoother
 from mrtm.joint.graph import GraphError, JointGraph
 
 FloatArray = npt.NDArray[np.float64]
@@ -320,6 +320,33 @@ def test_a_large_graph_stays_within_millimetres_and_ends_at_the_optimum(monkeypa
     assert max(off) < 0.005
     graph.optimize_fully()
     assert distance(graph.estimates(), batch_optimum(graph, graph.estimates())) < 1e-6
+
+
+def test_a_large_graph_is_linearised_anew_in_portions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One loop turns most of a long chain: the next updates work that off, without one that takes it all."""
+    monkeypatch.setattr(smoother, "_LARGE", 100)
+    monkeypatch.setattr(smoother, "_PORTION", 30)
+    world, portions, plain = World(7, 220, turn=0.3), [], relinearization.portion
+
+    def remember(*asked: Any) -> Any:
+        portions.append(len(plain(*asked)))
+        return plain(*asked)
+
+    monkeypatch.setattr(smoother, "portion", remember)
+    graph = JointGraph(vertex(0))
+    chain = world.chain()
+    for edge in chain[:199]:
+        graph.update(add=[edge])
+    assert not any(portions)
+    loop, off = replace(world.edge(500, 199, 5, EdgeKind.LOOP), kind=EdgeKind.INTER_VERTEX), []
+    for edge in [loop, *chain[199:]]:
+        graph.update(add=[edge])
+        off.append(distance(graph.estimates(), batch_optimum(graph, graph.estimates())))
+    assert portions.count(30) > 2
+    assert max(portions) == 30
+    assert portions[-1] == 0
+    assert off[-1] < 0.02
+    assert off[-1] < 0.5 * off[0]
 
 
 @pytest.mark.parametrize("most", [20, 1000])  # variables that are solved to the last digit
