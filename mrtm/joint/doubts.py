@@ -21,7 +21,7 @@ from factors import FULL_WEIGHT, EdgeId, EdgeKind, GraphEdge
 from factors.noise import FloatArray
 from mrtm.joint.agreeing import agreeing, clique
 from mrtm.joint.equations import CERTAIN, Equations
-from mrtm.joint.pairs import LEAST_SUPPORT, outnumbers
+from mrtm.joint.sightings.pairs import LEAST_SUPPORT, outnumbers
 
 GATE = {2: 26.99, 3: 30.0}
 """chi2 of so many degrees of freedom that a true edge has at most: one in 720,000 has more. Loops of real logs need

@@ -35,7 +35,7 @@ from scipy.sparse.linalg import spsolve
 from factors import GraphEdge, VertexId
 from frontend import se2
 from frontend.records import FloatArray
-from mrtm.joint.agreement import SurfaceMap
+from mrtm.joint.alignment.agreement import SurfaceMap
 from mrtm.joint.surfels import ALONG, REACH, IntArray, Surfels, expect
 from mrtm.joint.tree import shortest_paths
 from mrtm.progress import Progress

@@ -13,7 +13,7 @@ from scipy.ndimage import uniform_filter
 from factors import EdgeKind, VertexId
 from frontend.local_map import LocalMap
 from frontend.records import FloatArray
-from mrtm.joint.agreement import Lookup, overlap
+from mrtm.joint.alignment.agreement import Lookup, overlap
 from mrtm.joint.crispness import opinions
 from mrtm.joint.graph import JointGraph
 from mrtm.moving import moved

@@ -4,9 +4,9 @@ import gtsam
 import numpy as np
 
 from factors import UncertainPose, VertexId
-from mrtm.joint.agreement import Decision
+from mrtm.joint.alignment.agreement import Decision
 from mrtm.joint.joint_map import JointMap
-from mrtm.joint.map_evidence import MapEvidence
+from mrtm.joint.sightings.map_evidence import MapEvidence
 from mrtm.team.surfaces import Surfaces
 
 SAME = np.array([0.1, 0.1, 0.02])  # metres and radians within which a question is that of before

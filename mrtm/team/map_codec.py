@@ -18,7 +18,7 @@ import zstandard
 
 from frontend.local_map import Grid
 from frontend.records import FloatArray
-from mrtm.joint.agreement import FREE
+from mrtm.joint.alignment.agreement import FREE
 from mrtm.joint.fusion import FREE_VOTE, OCCUPIED_VOTE
 from mrtm.team.checks import MOST_POINTS, RecordError, check_frame
 

@@ -17,7 +17,7 @@ from factors import (
     fusing_edge,
 )
 from mrtm.joint.graph import JointGraph
-from mrtm.joint.hypotheses import KEPT, Hypothesis, Slack
+from mrtm.joint.sightings.hypotheses import KEPT, Hypothesis, Slack
 from mrtm.team.records import AnchorRecord, SightingRecord
 from mrtm.team.store import Store
 

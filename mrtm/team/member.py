@@ -16,8 +16,8 @@ from frontend.local_map import Bends, LocalMap, contents
 from frontend.local_slam import Visit
 from frontend.records import FloatArray, LaserScan
 from mrtm.config import Config
-from mrtm.joint.common_frame import adjoint
 from mrtm.joint.graph import JointGraph
+from mrtm.joint.sightings.common_frame import adjoint
 from mrtm.result import EdgeFate, Event
 from mrtm.robot.poses import pose_of
 from mrtm.robot.robot import Robot

@@ -10,8 +10,8 @@ import numpy as np
 from factors import GraphEdge, VertexId
 from frontend import se2
 from mrtm.config import Config
-from mrtm.joint.consistency import Verdict
 from mrtm.joint.graph import JointGraph
+from mrtm.joint.sightings.consistency import Verdict
 from mrtm.result import EdgeFate, Latency, Meeting, RunResult, SightingFate, TeamStory, Trajectory
 from mrtm.robot.poses import array_of
 from mrtm.team.codec import pack

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from weakref import WeakValueDictionary
 
 from factors import VertexId
-from mrtm.joint.surface import Surface
+from mrtm.joint.alignment.surface import Surface
 from mrtm.team.records import Key, Kind, MapRecord
 from mrtm.team.store import Store
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from factors import Edge, EdgeId, GraphEdge, SightingEdge
 from mrtm.config import Config
-from mrtm.joint.aligner import Aligner
-from mrtm.joint.consistency import Judgement, Verdict, judge
-from mrtm.joint.hypotheses import HypothesisId
+from mrtm.joint.alignment.aligner import Aligner
 from mrtm.joint.joint_map import Component, JointMap
+from mrtm.joint.sightings.consistency import Judgement, Verdict, judge
+from mrtm.joint.sightings.hypotheses import HypothesisId
 from mrtm.team.evidence import Answers, Evidence
 from mrtm.team.meeting import anchored, bridges, fusing_edges, sightings
 from mrtm.team.records import EdgeRecord, Key, SightingRecord, VertexRecord

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
 from factors.sighting import Sighting
 from mrtm.joint.graph import JointGraph
-from mrtm.joint.hypotheses import Hypothesis
+from mrtm.joint.sightings.hypotheses import Hypothesis
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
 from factors.sighting import Sighting
 from frontend.local_map import Grid, LocalMap
 from mrtm.config import Config, load_config
-from mrtm.joint.hypotheses import Hypothesis
+from mrtm.joint.sightings.hypotheses import Hypothesis
 from mrtm.team.codec import pack
 from mrtm.team.member import MemberRun
 from mrtm.team.records import AnchorRecord, EdgeRecord, Record, SightingRecord, VertexRecord

@@ -8,9 +8,9 @@ from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
 from frontend import se2
 from frontend.local_map import Grid
 from frontend.records import FloatArray
-from mrtm.joint.agreement import Decision, Lookup, agreement, known, overlap, scores
+from mrtm.joint.alignment.agreement import Decision, Lookup, agreement, known, overlap, scores
 from mrtm.joint.graph import JointGraph
-from mrtm.joint.map_evidence import MapEvidence, fit
+from mrtm.joint.sightings.map_evidence import MapEvidence, fit
 
 RESOLUTION = 0.05
 HALF = np.array([0.4, 0.4, 0.06])

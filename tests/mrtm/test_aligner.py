@@ -9,11 +9,11 @@ import pytest
 from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
 from frontend import se2
 from frontend.records import FloatArray
-from mrtm.joint import aligner as module
-from mrtm.joint.aligner import Aligner
-from mrtm.joint.alignment import Alignment, align
+from mrtm.joint.alignment import aligner as module
+from mrtm.joint.alignment.align import Alignment, align
+from mrtm.joint.alignment.aligner import Aligner
+from mrtm.joint.alignment.surface import Surface
 from mrtm.joint.graph import JointGraph
-from mrtm.joint.surface import Surface
 from mrtm.robot.poses import array_of, pose_of
 from tests.mrtm.wall_maps import Wall, seen
 

@@ -12,12 +12,12 @@ from factors import UncertainPose
 from frontend import se2
 from frontend.local_map import Bends
 from frontend.records import FloatArray
-from mrtm.joint.alignment import Alignment, align
-from mrtm.joint.buckets import Buckets
-from mrtm.joint.correlative import hypotheses
-from mrtm.joint.fit import DRAWN, FLOOR, fit
-from mrtm.joint.icp import COARSE, FINE, SCALE, icp
-from mrtm.joint.surface import Surface, partners, rotation
+from mrtm.joint.alignment.align import Alignment, align
+from mrtm.joint.alignment.buckets import Buckets
+from mrtm.joint.alignment.correlative import hypotheses
+from mrtm.joint.alignment.fit import DRAWN, FLOOR, fit
+from mrtm.joint.alignment.icp import COARSE, FINE, SCALE, icp
+from mrtm.joint.alignment.surface import Surface, partners, rotation
 from mrtm.robot.poses import array_of, pose_of
 from tests.mrtm.wall_maps import Wall, seen, unknown
 

@@ -4,8 +4,8 @@ import gtsam
 import numpy as np
 
 from factors import UncertainPose, VertexId
-from mrtm.joint.candidates import pairs
-from mrtm.joint.surface import Surface
+from mrtm.joint.alignment.candidates import pairs
+from mrtm.joint.alignment.surface import Surface
 from mrtm.robot.poses import array_of
 from tests.mrtm.wall_maps import Wall, seen, unknown
 

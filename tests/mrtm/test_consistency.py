@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from factors import UncertainPose, VertexId, compose, inverse
-from mrtm.joint.agreement import Decision
-from mrtm.joint.common_frame import examine, exp, solve
-from mrtm.joint.consistency import SLACKS, Consistency, Verdict, judge
+from mrtm.joint.alignment.agreement import Decision
 from mrtm.joint.graph import GraphError, JointGraph
-from mrtm.joint.hypotheses import Hypothesis, HypothesisId, Measurements, OwnMap, RobotGraph, Slack
-from mrtm.joint.innovation import votes
+from mrtm.joint.sightings.common_frame import examine, exp, solve
+from mrtm.joint.sightings.consistency import SLACKS, Consistency, Verdict, judge
+from mrtm.joint.sightings.hypotheses import Hypothesis, HypothesisId, Measurements, OwnMap, RobotGraph, Slack
+from mrtm.joint.sightings.innovation import votes
 from tests.mrtm.sighting_world import TeamWorld, without_heading
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from factors import AnchoredSighting, Edge, EdgeId, EdgeKind, SightingEdge, UncertainPose, VertexId
 from mrtm.joint.graph import JointGraph
-from mrtm.joint.hypotheses import Slack
 from mrtm.joint.joint_map import JointMap
+from mrtm.joint.sightings.hypotheses import Slack
 from mrtm.team.meeting import WEAK, anchored, bridges, fusing_edges, sightings
 from mrtm.team.records import AnchorRecord, EdgeRecord, SightingRecord
 from mrtm.team.store import Store

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from factors import VertexId, edge_from_dict
 from mrtm.evaluation import evaluate_output
-from mrtm.joint.hypotheses import Hypothesis
+from mrtm.joint.sightings.hypotheses import Hypothesis
 from mrtm.output.export import export
 from mrtm.output.report import run_report
 from mrtm.result import RunResult, TeamStory

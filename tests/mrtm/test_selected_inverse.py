@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_array, csc_array
 
-from mrtm.joint.selected_inverse import selected_inverse
+from mrtm.joint.sightings.selected_inverse import selected_inverse
 
 
 def graph_matrix(n: int, rng: np.random.Generator) -> csc_array:

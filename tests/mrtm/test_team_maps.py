@@ -12,8 +12,8 @@ from factors.sighting import Sighting
 from frontend import se2
 from frontend.records import FloatArray
 from mrtm.config import Config
-from mrtm.joint.consistency import Verdict
-from mrtm.joint.surface import Surface
+from mrtm.joint.alignment.surface import Surface
+from mrtm.joint.sightings.consistency import Verdict
 from mrtm.robot.poses import array_of, pose_of
 from mrtm.team.records import AnchorRecord, EdgeRecord, MapRecord, Record, SightingRecord, VertexRecord
 from mrtm.team.teammate import Teammate

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
 from factors.sighting import Sighting
-from mrtm.joint.consistency import Verdict
+from mrtm.joint.sightings.consistency import Verdict
 from mrtm.team.exchange import exchange
 from mrtm.team.records import AnchorRecord, EdgeRecord, Key, Kind, Record, SightingRecord
 from mrtm.team.teammate import Peers, Teammate

@@ -7,7 +7,7 @@ import numpy as np
 from frontend import se2
 from frontend.local_map import Bends, Grid
 from frontend.records import FloatArray
-from mrtm.joint.surface import Surface
+from mrtm.joint.alignment.surface import Surface
 
 Wall = tuple[float, float, float, float]
 RESOLUTION = 0.05

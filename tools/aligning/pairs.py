@@ -11,9 +11,9 @@ from factors import UncertainPose
 from frontend import se2
 from frontend.records import FloatArray
 from mrtm.config import load_config
-from mrtm.joint.agreement import overlap
-from mrtm.joint.alignment import Alignment, align
-from mrtm.joint.surface import Surface, partners
+from mrtm.joint.alignment.agreement import overlap
+from mrtm.joint.alignment.align import Alignment, align
+from mrtm.joint.alignment.surface import Surface, partners
 from mrtm.robot.poses import array_of, pose_of
 from mrtm.session import map_scans
 from mrtm.team.map_codec import pack_map, unpack_map

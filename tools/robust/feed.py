@@ -16,9 +16,9 @@ from frontend import se2
 from frontend.local_map import Grid, LocalMap
 from mrtm.config import load_config
 from mrtm.evaluation.ate import align
-from mrtm.joint.aligner import Attempt
-from mrtm.joint.consistency import Verdict
-from mrtm.joint.surface import Surface
+from mrtm.joint.alignment.aligner import Attempt
+from mrtm.joint.alignment.surface import Surface
+from mrtm.joint.sightings.consistency import Verdict
 from mrtm.robot.poses import array_of
 from mrtm.team.records import AnchorRecord, EdgeRecord, Record, SightingRecord, VertexRecord
 from mrtm.team.teammate import Peers, Teammate

@@ -9,7 +9,7 @@ from numba import njit
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
-from mrtm.joint.hypotheses import BoolArray, FloatArray, IntArray
+from mrtm.joint.sightings.hypotheses import BoolArray, FloatArray, IntArray
 
 
 def selected_inverse(matrix: csc_array, wanted: tuple[IntArray, IntArray]) -> FloatArray:

@@ -10,7 +10,7 @@ from scipy.ndimage import maximum_filter
 
 from frontend import se2
 from frontend.records import FloatArray
-from mrtm.joint.surface import Surface, rotation
+from mrtm.joint.alignment.surface import Surface, rotation
 
 SIGMAS = 3.0  # of the guess searched to each side, and at least
 BASIN_XY, BASIN_THETA = 0.3, 0.06  # metres and radians more: no guess is that good

@@ -22,9 +22,9 @@ from functools import lru_cache
 import numpy as np
 
 from factors import UncertainPose, VertexId
-from mrtm.joint.hypotheses import Hypothesis, HypothesisId, OwnMap, RobotGraph, Slack
-from mrtm.joint.joining import Joining, Pair
-from mrtm.joint.pairs import LEAST_SUPPORT, Evidence, Finding, outnumbers
+from mrtm.joint.sightings.hypotheses import Hypothesis, HypothesisId, OwnMap, RobotGraph, Slack
+from mrtm.joint.sightings.joining import Joining, Pair
+from mrtm.joint.sightings.pairs import LEAST_SUPPORT, Evidence, Finding, outnumbers
 
 SLACKS = (Slack(0.0, 0.0), Slack(0.05, 0.05), Slack(0.1, 0.1), Slack(0.15, 0.2))
 """Tried in this order until one explains the scatter. Sightings cut out of real logs needed the third and fourth;

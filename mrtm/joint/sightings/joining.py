@@ -9,10 +9,10 @@ import numpy as np
 
 from factors import UncertainPose, adjoint_transport
 from frontend import se2
-from mrtm.joint.common_frame import CommonFrame, examine, solve
-from mrtm.joint.hypotheses import BoolArray, FloatArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
-from mrtm.joint.innovation import gates
-from mrtm.joint.pairs import LEAST_SUPPORT, Evidence, Finding, Proposed, find, outnumbers
+from mrtm.joint.sightings.common_frame import CommonFrame, examine, solve
+from mrtm.joint.sightings.hypotheses import BoolArray, FloatArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
+from mrtm.joint.sightings.innovation import gates
+from mrtm.joint.sightings.pairs import LEAST_SUPPORT, Evidence, Finding, Proposed, find, outnumbers
 
 Pair = tuple[str, str]
 

@@ -15,9 +15,9 @@ from scipy.sparse import bsr_array, csc_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from frontend import se2
-from mrtm.joint.hypotheses import BoolArray, FloatArray, IntArray, Measurements, OwnMap
-from mrtm.joint.innovation import innovations
-from mrtm.joint.selected_inverse import selected_inverse
+from mrtm.joint.sightings.hypotheses import BoolArray, FloatArray, IntArray, Measurements, OwnMap
+from mrtm.joint.sightings.innovation import innovations
+from mrtm.joint.sightings.selected_inverse import selected_inverse
 
 _STEPS, _SETTLED = 10, 1e-4
 

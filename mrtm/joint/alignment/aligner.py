@@ -11,10 +11,10 @@ import gtsam
 import numpy as np
 
 from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId, inverse
-from mrtm.joint.alignment import Alignment, align
-from mrtm.joint.candidates import Candidate, pairs
+from mrtm.joint.alignment.align import Alignment, align
+from mrtm.joint.alignment.candidates import Candidate, pairs
+from mrtm.joint.alignment.surface import Surface
 from mrtm.joint.graph import JointGraph
-from mrtm.joint.surface import Surface
 
 Pair = tuple[VertexId, VertexId]
 

@@ -9,11 +9,11 @@ import numpy as np
 from factors import UncertainPose
 from factors.noise import FloatArray
 from frontend import se2
-from mrtm.joint.agreement import Agreement, agreement, counts, scores
-from mrtm.joint.correlative import SIGMAS, hypotheses
-from mrtm.joint.fit import Fit, fit
-from mrtm.joint.icp import COARSE, FINE, icp
-from mrtm.joint.surface import Surface
+from mrtm.joint.alignment.agreement import Agreement, agreement, counts, scores
+from mrtm.joint.alignment.correlative import SIGMAS, hypotheses
+from mrtm.joint.alignment.fit import Fit, fit
+from mrtm.joint.alignment.icp import COARSE, FINE, icp
+from mrtm.joint.alignment.surface import Surface
 from mrtm.robot.poses import array_of, innovation, pose_of
 
 LEAST_OVERLAP = 10.0  # m^2 known in both maps

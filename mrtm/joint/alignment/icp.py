@@ -9,8 +9,8 @@ import numpy as np
 
 from frontend import se2
 from frontend.records import FloatArray
-from mrtm.joint.buckets import nearest
-from mrtm.joint.surface import FACING, Surface
+from mrtm.joint.alignment.buckets import nearest
+from mrtm.joint.alignment.surface import FACING, Surface
 
 
 class Round(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 
 from factors import UncertainPose, VertexId, compose, inverse
 from frontend import se2
-from mrtm.joint.agreement import (
+from mrtm.joint.alignment.agreement import (
     LEAST_POINTS,
     Agreement,
     Decision,
@@ -26,7 +26,7 @@ from mrtm.joint.agreement import (
     overlap,
     scores,
 )
-from mrtm.joint.hypotheses import RobotGraph, coordinates
+from mrtm.joint.sightings.hypotheses import RobotGraph, coordinates
 
 LEAST_OVERLAP = 20.0
 """Area known in both maps, m^2, below which they say nothing."""
@@ -110,7 +110,7 @@ def _best_score(a: Lookup, b: Lookup, poses: FloatArray, least: int) -> float:
 
 
 class MapEvidence:
-    """The word of the local maps, as :func:`mrtm.joint.consistency.judge` asks for it.
+    """The word of the local maps, as :func:`mrtm.joint.sightings.consistency.judge` asks for it.
 
     Args:
         maps: of all robots, ready for comparison.

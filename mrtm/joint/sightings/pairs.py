@@ -9,9 +9,9 @@ import gtsam
 import numpy as np
 
 from factors import UncertainPose, VertexId
-from mrtm.joint.agreement import Decision
-from mrtm.joint.consensus import Candidate, candidates
-from mrtm.joint.hypotheses import BoolArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
+from mrtm.joint.alignment.agreement import Decision
+from mrtm.joint.sightings.consensus import Candidate, candidates
+from mrtm.joint.sightings.hypotheses import BoolArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
 
 Evidence = Callable[[VertexId, VertexId, UncertainPose], Decision]
 """What the local maps around two vertices of different robots say of a pose tail_T_head."""

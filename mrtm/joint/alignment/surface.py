@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from frontend.local_map import Bends
 from frontend.records import FloatArray
-from mrtm.joint.agreement import Lookup, SurfaceMap
-from mrtm.joint.buckets import Buckets, nearest
+from mrtm.joint.alignment.agreement import Lookup, SurfaceMap
+from mrtm.joint.alignment.buckets import Buckets, nearest
 
 FACING = 0.7
 """Least cosine between the normals of two points of one surface. Walls are thin: the nearest point of another map is

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from frontend import se2
-from mrtm.joint.common_frame import CommonFrame, examine, solve
-from mrtm.joint.hypotheses import BoolArray, FloatArray, IntArray, Measurements, OwnMap
-from mrtm.joint.innovation import GATE_FULL, gates, votes
+from mrtm.joint.sightings.common_frame import CommonFrame, examine, solve
+from mrtm.joint.sightings.hypotheses import BoolArray, FloatArray, IntArray, Measurements, OwnMap
+from mrtm.joint.sightings.innovation import GATE_FULL, gates, votes
 
 _ROUNDS = 10
 _PARTNERS = 6  # sightings without heading each is paired with, those that fix the heading best

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from frontend import se2
 from frontend.local_map import Bends
 from frontend.records import FloatArray
-from mrtm.joint.surface import Surface, partners, rotation
+from mrtm.joint.alignment.surface import Surface, partners, rotation
 
 REACH = 0.15  # metres between the points of a pair
 PATCH = 1.5  # metres of a wall that share an error

@@ -12,10 +12,10 @@ import numpy as np
 from factors import UncertainPose, VertexId, inverse
 from frontend import se2
 from frontend.records import FloatArray
-from mrtm.joint.agreement import overlap
-from mrtm.joint.alignment import LEAST_OVERLAP
-from mrtm.joint.correlative import MAX_XY
-from mrtm.joint.surface import Surface
+from mrtm.joint.alignment.agreement import overlap
+from mrtm.joint.alignment.align import LEAST_OVERLAP
+from mrtm.joint.alignment.correlative import MAX_XY
+from mrtm.joint.alignment.surface import Surface
 from mrtm.robot.poses import array_of
 
 MOST = 12  # pairs an event

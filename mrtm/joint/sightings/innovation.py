@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-from mrtm.joint.hypotheses import BoolArray, FloatArray, IntArray, Measurements
+from mrtm.joint.sightings.hypotheses import BoolArray, FloatArray, IntArray, Measurements
 
 GATE_FULL, GATE_POSITION = 16.266, 13.816
 """chi2 at 99.9 % of 3 and of 2 degrees of freedom."""

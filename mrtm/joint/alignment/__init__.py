@@ -1,0 +1,1 @@
+"""Alignment of overlapping local maps, on line (M13)."""

@@ -1,0 +1,1 @@
+"""Which sightings between robots to believe, and how the robots' frames lie to each other (M11)."""
