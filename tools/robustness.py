@@ -45,7 +45,7 @@ def main(
     rows = []
     for row in all_rows():
         rows.append(row)
-        console.print(f"{row.false} {row.share}: {row.wrong} wrong", style="dim")
+        console.print(f"{row.false} {row.share}: {row.wrong} wrong, {row.found} of {row.true} found", style="dim")
     console.print(table(rows))
 
 
