@@ -30,6 +30,7 @@ from mrtm.timing import Stages
 GAP = 5.0  # seconds between two scans: where the robot was in between cannot be told
 EXACT = np.diag([1e-3, 1e-3, 1e-4]) ** 2  # covariance of a pose that defines its vertex, for others to divide by
 SQUARE = 3.0  # metres: what a map tells of its sureness, once in each
+LOST = 1e4  # m^2, the largest entry of a covariance that is told: beyond that nothing is known of a place anyway
 
 
 @dataclass(slots=True)
@@ -249,6 +250,7 @@ def _bends(vertex: Vertex) -> Bends:
     carry = adjoint(vertex.places)
     covariances = carry @ vertex.covariances @ np.swapaxes(carry, -1, -2)
     covariances = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
+    covariances /= np.maximum(np.abs(covariances).max(axis=(1, 2), keepdims=True) / LOST, 1.0)
     places, side, count = vertex.places[:, :2], SQUARE, MOST_PLACES + 1
     while count > MOST_PLACES:
         squares, which = np.unique(np.floor(places / side), axis=0, return_inverse=True)
