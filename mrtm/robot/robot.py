@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -154,10 +154,7 @@ class Robot:
             # The edge that this visit made (M8): its measurement, with the pose as it is known now.
             kind, fused = EdgeKind.LOOP, measured
         else:
-            kind, fused = (
-                EdgeKind.COVARIANCE_INTERSECTION,
-                intersect(edge.estimate, measured, self.config.topology.omega),
-            )
+            kind, fused = EdgeKind.COVARIANCE_INTERSECTION, fuse(edge.estimate, measured, self.config.topology.omega)
         newer = Edge(edge.id, edge.version + 1, kind, edge.tail, edge.head, fused.pose, fused.covariance)
         self.topology.put(newer)
         with self._stages("joint map"):
@@ -285,6 +282,19 @@ class Robot:
 
 
 TRIAL_SQUARE = 1.5  # a robot on trial must have its verdict within this multiple of the travel square
+
+CONTRADICTING = 11.34  # chi2 of 3 degrees of freedom that one in a hundred pairs of independent estimates exceeds
+
+
+def fuse(old: UncertainPose, new: UncertainPose, omega: float | Literal["optimal"]) -> UncertainPose:
+    """M5 of two estimates of an edge, see ``intersect``.
+
+    Where they contradict each other one has slipped, and neither is as sure as it says: the covariance grows as their
+    difference asks for (Birge 1932).
+    """
+    fused = intersect(old, new, omega)
+    _, chi2 = innovation(old, new)
+    return fused if chi2 < CONTRADICTING else UncertainPose(fused.pose, chi2 / 3.0 * fused.covariance)
 
 
 def _difference(expected: UncertainPose, measured: UncertainPose) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from frontend import se2
 from frontend.records import LaserScan
 from mrtm.joint.graph import JointGraph
 from mrtm.result import Event, RunResult
-from mrtm.robot.robot import Robot
+from mrtm.robot.robot import Robot, fuse
 from mrtm.timing import Stages
 from tests.mrtm.small_logs import (
     SIDE,
@@ -280,6 +280,15 @@ def test_m5_the_weight_of_the_new_estimate_is_omega() -> None:
             old = versions[edge.id, edge.version - 1]
             assert old.measurement.equals(edge.measurement, 1e-9) is not moves
             assert np.allclose(old.covariance, edge.covariance, rtol=1e-6) is not moves
+
+
+def test_m5_two_estimates_that_contradict_each_other_are_less_sure_than_either() -> None:
+    covariance = np.diag([0.03, 0.03, 0.005]) ** 2
+    old = UncertainPose(gtsam.Pose2(5.0, 0.0, 0.0), covariance)
+    for offset, contradicts in ((0.1, False), (0.2, True)):
+        new = UncertainPose(gtsam.Pose2(5.0 + offset, 0.0, 0.0), 1.1 * covariance)
+        fused = fuse(old, new, "optimal")
+        assert (np.linalg.det(fused.covariance) > np.linalg.det(new.covariance)) == contradicts
 
 
 def test_the_joint_map_is_told_every_version_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
