@@ -42,6 +42,10 @@ LOOKED = 128  # doubted edges that a new doubted one is held against, the latest
 ROUNDS = 8  # of edges that come in and go out after a change, beside the new ones
 NEARER = 0.5  # of the chi2 that a doubted edge had when it was judged, for it to be judged again
 
+SLIP = 100.0
+"""chi2 by which edges that agree may strain those that cannot be false, beside their own noise: the robot may have
+slipped along a wall by ten times what it thinks. Look-alike places are farther apart."""
+
 _FALSE_AREA = math.pi * 10.0**2
 
 
@@ -175,7 +179,7 @@ def _contradicted(equations: Equations, members: Sequence[EdgeId]) -> list[EdgeI
         equations.doubt([*members, *went])
         before = equations.cost()
         equations.believe(members, kernel=False)
-    if may and not _strained(equations) and equations.cost() - before <= _set_gate(len(members)):
+    if may and not _strained(equations) and equations.cost() - before <= _set_gate(len(members)) + SLIP:
         equations.put_under_kernel(members)
         return went
     equations.doubt(members)

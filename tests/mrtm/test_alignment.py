@@ -167,7 +167,7 @@ def test_another_room_is_refused(room: tuple[Surface, Surface]) -> None:
 
 
 def test_a_guess_that_is_wrong_is_not_followed(room: tuple[Surface, Surface]) -> None:
-    alignment = align(*room, guess((0.02, 0.02, 0.005), (0.2, 0.0, 0.0)))
+    alignment = align(*room, guess((0.02, 0.02, 0.005), (0.25, 0.0, 0.0)))
     assert alignment is not None
     assert "from the guess" in (alignment.refusal or "")
 

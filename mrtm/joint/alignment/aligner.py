@@ -113,16 +113,20 @@ class Aligner:
         return bool(due)
 
     def take_back(self, graph: JointGraph) -> list[EdgeId]:
-        """Give up alignments in ``graph`` that the joint estimate contradicts; their edges are to be removed."""
+        """Give up alignments in ``graph`` that the joint estimate contradicts; their edges are to be removed.
+
+        But those wait that the graph doubts while the question is what it was: more that agree with them may come.
+        """
         gone = []
-        present = {edge.id for edge in graph.edges()}
-        for pair, attempt in self.attempts.items():
+        present, doubted = {edge.id for edge in graph.edges()}, graph.doubted()
+        for (a, b), attempt in self.attempts.items():
             if attempt.edge is None or attempt.edge.id not in present:
                 continue
             chi2 = graph.chi2(attempt.edge.id)
-            if chi2 > CONTRADICTED:
+            waits = attempt.edge.id in doubted and _moved(attempt, graph.estimate(a).between(graph.estimate(b))) < MOVED
+            if chi2 > CONTRADICTED and not waits:
                 reason = f"taken back: chi2 {chi2:.1f} from the joint estimate, more than {CONTRADICTED}"
-                self.attempts[pair] = Attempt(attempt.maps, attempt.guess, attempt.found, None, reason)
+                self.attempts[a, b] = Attempt(attempt.maps, attempt.guess, attempt.found, None, reason)
                 gone.append(attempt.edge.id)
         return gone
 
