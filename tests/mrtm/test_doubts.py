@@ -89,6 +89,19 @@ def test_three_that_agree_put_out_nothing() -> None:
     assert ring.graph.doubted() == {edge.id for edge in false}
 
 
+@pytest.mark.parametrize(("slip", "believed"), [(0.25, True), (1.0, False)])
+def test_four_that_agree_outvote_a_slip_but_not_a_look_alike_place(slip: float, believed: bool) -> None:
+    ring = Ring(9)
+    # As if the robot, between 30 and 31, had come farther than it noticed.
+    aside = ring.truth[30].compose(gtsam.Pose2(slip, 0.0, 0.0)).compose(ring.truth[30].inverse())
+    over = [ring.edge(100 + n, 30, 31, moved=aside) for n in range(4)]
+    for number, edge in enumerate(over, 1):
+        ring.graph.update(add=[edge])
+        if number < 4:
+            assert ring.graph.doubted() == {e.id for e in over[:number]}
+    assert ring.graph.doubted() == (frozenset() if believed else {e.id for e in over})
+
+
 def test_edges_come_in_when_the_estimate_has_come_near() -> None:
     """Where many are false one loop is not believed across a long drift, but when others have closed it."""
     ring = Ring(4)
