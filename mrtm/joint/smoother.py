@@ -35,8 +35,8 @@ class _Tolerance(NamedTuple):
 # The estimate is within about 2e-5 of the optimum.
 _EXACT = _Tolerance(1e-4, 1e-5)
 
-# Of a large graph only what ``relinearization`` has chosen is linearised anew.
-_COARSE = _Tolerance(1e-4, 1e-3)
+# Of a large graph as ``relinearization`` has it; this is for what is done at once, before a kernel weighs a loop.
+_COARSE = _Tolerance(3e-3, 1e-3)
 _LARGE = 1000  # variables
 _PORTION = 100  # variables that one update of a large graph linearises anew, unless it has more new factors itself
 _PATIENCE = 5  # updates before the next portion, of those that only add vertices; of others twice as many
