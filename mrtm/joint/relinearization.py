@@ -4,8 +4,8 @@ What a large graph makes others wait for is to linearise it anew: at a loop that
 things tame that. A factor between two poses is linear in their positions, so that a part which moves far and turns
 little need not be linearised anew: what is left is of the second order in the turn. Only a kernel cares for positions,
 since its weight is that of the residual where it was linearised. And the work comes in portions of neighbours, which
-share most of what has to be eliminated again, around the variable that needs it most. See
-``python -m tools.benchmark --backend``.
+share most of what has to be eliminated again, around the variable that needs it most: in updates that only add
+vertices, which have little else to do. See ``python -m tools.benchmark --backend``.
 """
 
 from collections.abc import Callable

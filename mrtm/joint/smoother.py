@@ -35,8 +35,8 @@ class _Tolerance(NamedTuple):
 # The estimate is within about 2e-5 of the optimum.
 _EXACT = _Tolerance(1e-4, 1e-5)
 
-# Of a large graph only what ``relinearization`` has chosen is linearised anew.
-_COARSE = _Tolerance(1e-4, 1e-3)
+# Of a large graph as ``relinearization`` has it; this is for what is done at once, before a kernel weighs a loop.
+_COARSE = _Tolerance(3e-3, 1e-3)
 _LARGE = 1000  # variables
 _PORTION = 100  # variables that one update of a large graph linearises anew, unless it has more new factors itself
 _PATIENCE = 5  # updates before the next portion, of those that only add vertices; of others twice as many
@@ -105,11 +105,13 @@ class Smoother:
             self.settle()
 
     def settle(self) -> None:
-        """Linearise anew until nothing is left to be."""
-        for _ in range(_MAX_STEPS):
+        """Linearise anew until nothing is left to be; of a large graph once all that has moved by 3 mm or 3 mrad."""
+        exact = self._tolerance is _EXACT
+        for _ in range(_MAX_STEPS if exact else 1):
             if self._solve(lambda: self._insert({}, gtsam.Values(), (), None)) == 0:
                 return
-        self.refine()
+        if exact:
+            self.refine()
 
     def refine(self) -> None:
         """Levenberg-Marquardt over everything from the present estimate, then iSAM2 anew from there."""
