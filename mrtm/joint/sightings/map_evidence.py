@@ -13,7 +13,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from factors import UncertainPose, VertexId, compose, inverse
+from factors import UncertainPose, VertexId
 from frontend import se2
 from mrtm.joint.alignment.agreement import (
     LEAST_POINTS,
@@ -26,6 +26,7 @@ from mrtm.joint.alignment.agreement import (
     overlap,
     scores,
 )
+from mrtm.joint.sightings.common_frame import adjoint
 from mrtm.joint.sightings.hypotheses import RobotGraph, coordinates
 
 LEAST_OVERLAP = 20.0
@@ -48,8 +49,11 @@ WIDEST = (1.2, 0.25)
 
 KEPT = 2**14  # answers
 
+NEAREST = 10
+"""Pairs of local maps that are looked at, those whose vertices lie nearest to each other."""
+
 MOST_PAIRS = 3
-"""Pairs of local maps that are compared, those that overlap most."""
+"""Pairs of them that are compared, those that overlap most."""
 
 _THINNED = 4  # one point in so many gives a score to about
 _ROUGHLY = 0.1
@@ -113,31 +117,34 @@ class MapEvidence:
     """The word of the local maps, as :func:`mrtm.joint.sightings.consistency.judge` asks for it.
 
     Args:
-        maps: of all robots, ready for comparison.
-        graphs: each robot's own, by name, with all vertices that have a map.
+        maps: of all robots, ready for comparison, all at vertices that the graphs have; only those are looked at that
+            are to be compared.
+        graphs: each robot's own, by name.
     """
 
     def __init__(self, maps: Mapping[VertexId, Lookup], graphs: Mapping[str, RobotGraph]) -> None:
         self._maps, self._graphs = maps, graphs
+        self._owned: dict[str, tuple[VertexId, ...]] = {}
+        for vertex in sorted(maps):
+            self._owned[vertex.robot] = (*self._owned.get(vertex.robot, ()), vertex)
 
     def __call__(self, tail: VertexId, head: VertexId, tail_T_head: UncertainPose) -> Decision:
         """What the maps of two robots say if ``head`` lies there: one contradiction outweighs any agreement."""
-        overlaps = []
-        heads = self._seen_from(head)
-        if not heads:
+        ours, theirs = (self._owned.get(end.robot, ()) for end in (tail, head))
+        if not (ours and theirs):
             return Decision.UNDECIDED
-        poses = np.array([coordinates(head_T_v.pose) for _, head_T_v in heads])
-        carry = np.array([head_T_v.pose.inverse().AdjointMap() for _, head_T_v in heads])
-        covariances = np.array([head_T_v.covariance for _, head_T_v in heads])
-        for u, tail_T_u in self._seen_from(tail):
-            u_T_head = compose(inverse(tail_T_u), tail_T_head)
-            seen = se2.compose(np.array(coordinates(u_T_head.pose)), poses)
-            spread = carry @ u_T_head.covariance @ carry.transpose(0, 2, 1) + covariances
-            sigma = np.sqrt(spread.diagonal(axis1=1, axis2=2))
-            sure = (sigma[:, :2].max(axis=1) < WIDEST[0] / SIGMAS) & (sigma[:, 2] < WIDEST[1] / SIGMAS)
-            for place in np.flatnonzero(sure):
-                v, question = heads[place][0], _question(seen[place], sigma[place])
-                overlaps.append((_overlap(self._maps[u], self._maps[v], question), u, v, question))
+        overlaps = []
+        seen, sigma = _between(
+            _seen_from(self._graphs[tail.robot], tail, ours), tail_T_head, _seen_from(self._graphs[head.robot], head, theirs)
+        )
+        sure = (sigma[..., :2].max(axis=-1) < WIDEST[0] / SIGMAS) & (sigma[..., 2] < WIDEST[1] / SIGMAS)
+        near = np.where(sure, np.hypot(seen[..., 0], seen[..., 1]), np.inf).ravel()
+        for place in np.argsort(near, kind="stable")[:NEAREST]:
+            if not np.isfinite(near[place]):
+                break
+            i, k = np.unravel_index(place, sure.shape)
+            u, v, question = ours[i], theirs[k], _question(seen[i, k], sigma[i, k])
+            overlaps.append((_overlap(self._maps[u], self._maps[v], question), u, v, question))
         overlaps.sort(key=lambda o: (-o[0], o[1], o[2]))
         said = {
             _decision(self._maps[u], self._maps[v], question)
@@ -146,11 +153,30 @@ class MapEvidence:
         }
         return next((word for word in (Decision.CONTRADICTS, Decision.AGREES) if word in said), Decision.UNDECIDED)
 
-    def _seen_from(self, vertex: VertexId) -> list[tuple[VertexId, UncertainPose]]:
-        """The vertices of a robot that have a map, and where each lies, seen from one of the robot's vertices."""
-        graph, here = self._graphs[vertex.robot], UncertainPose(gtsam.Pose2(), np.zeros((3, 3)))
-        owned = sorted(v for v in self._maps if v.robot == vertex.robot)
-        return [(v, here if v == vertex else graph.relative(vertex, v)) for v in owned]
+
+class _Around(NamedTuple):
+    """Where n vertices of a robot lie, seen from one of them: ``poses`` (n, 3) and their ``covariances`` (n, 3, 3)."""
+
+    poses: FloatArray
+    covariances: FloatArray
+
+
+@lru_cache(512)
+def _seen_from(graph: RobotGraph, vertex: VertexId, others: tuple[VertexId, ...]) -> _Around:
+    here = UncertainPose(gtsam.Pose2(), np.zeros((3, 3)))
+    seen = [here if v == vertex else graph.relative(vertex, v) for v in others]
+    return _Around(np.array([coordinates(s.pose) for s in seen]), np.array([s.covariance for s in seen]))
+
+
+def _between(ours: _Around, tail_T_head: UncertainPose, theirs: _Around) -> tuple[FloatArray, FloatArray]:
+    """The poses (n, k, 3) of their vertices seen from ours, and their standard deviations (n, k, 3)."""
+    u_T_head = se2.between(ours.poses, np.array(coordinates(tail_T_head.pose)))
+    back = adjoint(se2.inverse(u_T_head))
+    at_head = back @ ours.covariances @ np.swapaxes(back, -1, -2) + tail_T_head.covariance
+    back = adjoint(se2.inverse(theirs.poses))
+    at_v = back @ at_head[:, None] @ np.swapaxes(back, -1, -2) + theirs.covariances
+    seen = se2.compose(u_T_head[:, None], theirs.poses[None])
+    return seen, np.sqrt(np.diagonal(at_v, axis1=-2, axis2=-1))
 
 
 class _Question(NamedTuple):
