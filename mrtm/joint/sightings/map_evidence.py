@@ -65,15 +65,12 @@ _SHIFTS = np.arange(0.6, 4.01, 0.2)
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Two local maps at the pose that fits best: a_T_b (3,), how they agree there, and how clearly.
+    """Two local maps ``a`` and ``b`` at the ``pose`` a_T_b (3,) that fits best, and how they agree there."""
 
-    Attributes:
-        lead: score there less the best score with one map moved along.
-    """
-
+    a: Lookup
+    b: Lookup
     pose: FloatArray
     agreement: Agreement
-    lead: float
 
     @property
     def decision(self) -> Decision:
@@ -84,7 +81,20 @@ class Fit:
         if found.hits <= CONTRADICTING[0] and found.conflicts >= CONTRADICTING[1]:
             return Decision.CONTRADICTS
         agrees = found.hits >= AGREEING[0] and found.conflicts <= AGREEING[1]
-        return Decision.AGREES if agrees and self.lead >= UNIQUE else Decision.UNDECIDED
+        return Decision.AGREES if agrees and self.lead() >= UNIQUE else Decision.UNDECIDED
+
+    def lead(self) -> float:
+        """How clearly they fit: the score there less the best score with one map moved along, which takes long."""
+        a, b, pose = self.a, self.b, self.pose
+        axis = _weak_direction(a, b, pose)
+        way = np.concatenate([_SHIFTS, -_SHIFTS])
+        moved = []
+        for angle in (axis, axis + 0.5 * np.pi):
+            shift = np.outer(way, [np.cos(angle), np.sin(angle), 0.0])
+            moved.append(se2.compose((pose + shift)[:, None], _around(_FINE, 0.1, 0.02)[None]).reshape(-1, 3))
+        # Moved sideways two corridors touch wall to wall, which is no overlap: that leaves few of the points.
+        elsewhere = _best_score(a, b, np.concatenate(moved), max(LEAST_POINTS, self.agreement.points // 2))
+        return float(scores(a, b, pose[None])[0] - elsewhere)
 
 
 def fit(a: Lookup, b: Lookup, guess: FloatArray, half: FloatArray) -> Fit:
@@ -95,16 +105,7 @@ def fit(a: Lookup, b: Lookup, guess: FloatArray, half: FloatArray) -> Fit:
         score = scores(a, b, tried, thinned=thinned)
         if score.max() > scores(a, b, pose[None], thinned=thinned)[0]:
             pose = tried[int(np.argmax(score))]
-    axis = _weak_direction(a, b, pose)
-    way = np.concatenate([_SHIFTS, -_SHIFTS])
-    moved = []
-    for angle in (axis, axis + 0.5 * np.pi):
-        shift = np.outer(way, [np.cos(angle), np.sin(angle), 0.0])
-        moved.append(se2.compose((pose + shift)[:, None], _around(_FINE, 0.1, 0.02)[None]).reshape(-1, 3))
-    here = agreement(a, b, pose)
-    # Moved sideways two corridors touch wall to wall, which is no overlap: that leaves few of the points.
-    elsewhere = _best_score(a, b, np.concatenate(moved), max(LEAST_POINTS, here.points // 2))
-    return Fit(pose, here, float(scores(a, b, pose[None])[0] - elsewhere))
+    return Fit(a, b, pose, agreement(a, b, pose))
 
 
 def _best_score(a: Lookup, b: Lookup, poses: FloatArray, least: int) -> float:
@@ -128,15 +129,20 @@ class MapEvidence:
         for vertex in sorted(maps):
             self._owned[vertex.robot] = (*self._owned.get(vertex.robot, ()), vertex)
 
-    def __call__(self, tail: VertexId, head: VertexId, tail_T_head: UncertainPose) -> Decision:
-        """What the maps of two robots say if ``head`` lies there: one contradiction outweighs any agreement."""
+    def __call__(
+        self, tail: VertexId, head: VertexId, tail_T_head: UncertainPose, veto: bool = False
+    ) -> Decision:
+        """What the maps of two robots say if ``head`` lies there: one contradiction outweighs any agreement.
+
+        Args:
+            veto: whether only a contradiction matters; then no agreement is looked for.
+        """
         ours, theirs = (self._owned.get(end.robot, ()) for end in (tail, head))
         if not (ours and theirs):
             return Decision.UNDECIDED
         overlaps = []
-        seen, sigma = _between(
-            _seen_from(self._graphs[tail.robot], tail, ours), tail_T_head, _seen_from(self._graphs[head.robot], head, theirs)
-        )
+        near_tail = _seen_from(self._graphs[tail.robot], tail, ours)
+        seen, sigma = _between(near_tail, tail_T_head, _seen_from(self._graphs[head.robot], head, theirs))
         sure = (sigma[..., :2].max(axis=-1) < WIDEST[0] / SIGMAS) & (sigma[..., 2] < WIDEST[1] / SIGMAS)
         near = np.where(sure, np.hypot(seen[..., 0], seen[..., 1]), np.inf).ravel()
         for place in np.argsort(near, kind="stable")[:NEAREST]:
@@ -149,7 +155,7 @@ class MapEvidence:
         said = {
             _decision(self._maps[u], self._maps[v], question)
             for area, u, v, question in overlaps[:MOST_PAIRS]
-            if area >= LEAST_OVERLAP
+            if area >= LEAST_OVERLAP and not (veto and _fits_well(self._maps[u], self._maps[v], question))
         }
         return next((word for word in (Decision.CONTRADICTS, Decision.AGREES) if word in said), Decision.UNDECIDED)
 
@@ -195,6 +201,11 @@ def _question(pose: FloatArray, sigma: FloatArray) -> _Question:
 @lru_cache(KEPT)
 def _overlap(a: Lookup, b: Lookup, question: _Question) -> float:
     return overlap(a, b, np.array(question.pose))
+
+
+def _fits_well(a: Lookup, b: Lookup, question: _Question) -> bool:
+    """Whether two maps agree too well to contradict each other already where the fit begins, which makes it better."""
+    return bool(scores(a, b, np.array([question.pose]))[0] > CONTRADICTING[0] - CONTRADICTING[1])
 
 
 @lru_cache(KEPT)
