@@ -49,7 +49,7 @@ WIDEST = (1.2, 0.25)
 
 KEPT = 2**14  # answers
 
-NEAREST = 10
+NEAREST = 6
 """Pairs of local maps that are looked at, those whose vertices lie nearest to each other."""
 
 MOST_PAIRS = 3
