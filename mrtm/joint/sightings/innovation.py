@@ -138,9 +138,7 @@ def innovation(full, measured, tail_anchor, head_anchor, predicted, pose, r, h):
 def _innovations(full, measured, tail_anchor, head_anchor, predicted, residual, derivative):  # type: ignore[no-untyped-def]
     pose = np.empty(3)
     for j in range(len(full)):
-        innovation(
-            full[j], measured[j], tail_anchor[j], head_anchor[j], predicted[j], pose, residual[j], derivative[j]
-        )
+        innovation(full[j], measured[j], tail_anchor[j], head_anchor[j], predicted[j], pose, residual[j], derivative[j])
 
 
 @njit(cache=True)

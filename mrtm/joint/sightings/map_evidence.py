@@ -129,9 +129,7 @@ class MapEvidence:
         for vertex in sorted(maps):
             self._owned[vertex.robot] = (*self._owned.get(vertex.robot, ()), vertex)
 
-    def __call__(
-        self, tail: VertexId, head: VertexId, tail_T_head: UncertainPose, veto: bool = False
-    ) -> Decision:
+    def __call__(self, tail: VertexId, head: VertexId, tail_T_head: UncertainPose, veto: bool = False) -> Decision:
         """What the maps of two robots say if ``head`` lies there: one contradiction outweighs any agreement.
 
         Args:
