@@ -144,7 +144,7 @@ def _own_edges(maps: Sequence[OwnMap]) -> tuple[IntArray, FloatArray, FloatArray
 @lru_cache(KEPT)
 def _tree_edges(own: OwnMap) -> tuple[FloatArray, FloatArray]:
     at = own.tree[:, 0], own.tree[:, 1]
-    return own.relative[at], np.linalg.inv(own.covariances[at])
+    return own.relative[at], np.asarray(np.linalg.inv(own.covariances[at]), np.float64)
 
 
 @njit(cache=True)
