@@ -50,7 +50,8 @@ def check_covariance(covariance: npt.ArrayLike, what: str, size: int = 3) -> Flo
         raise FactorError(f"{what}: covariance has shape {matrix.shape}, expected ({size}, {size})")
     if not np.all(np.isfinite(matrix)):
         raise FactorError(f"{what}: covariance is not finite: {matrix.tolist()}")
-    if not np.allclose(matrix, matrix.T, rtol=1e-8, atol=1e-8 * np.abs(np.diag(matrix)).max()):
+    size_of = np.abs(matrix)
+    if (np.abs(matrix - matrix.T) > 1e-8 * (size_of + size_of.diagonal().max())).any():
         raise FactorError(f"{what}: covariance is not symmetric: {matrix.tolist()}")
     matrix = 0.5 * (matrix + matrix.T)
     eigenvalues = np.linalg.eigvalsh(matrix)

@@ -29,15 +29,6 @@ class Surfaces(Mapping[VertexId, Surface]):
         self._kept[vertex] = found
         return found
 
-    def state(self, robot: str) -> tuple[bytes, ...]:
-        """Names the maps of a robot as they are: equal if and only if these are."""
-        return tuple(item.hash for item in self._store.part(robot, Kind.MAP))
-
-    def of(self, robot: str) -> dict[VertexId, Surface]:
-        """The maps of one robot."""
-        vertices = (VertexId(robot, item.key.number) for item in self._store.part(robot, Kind.MAP))
-        return {vertex: self[vertex] for vertex in vertices}
-
     def __iter__(self) -> Iterator[VertexId]:
         return (VertexId(key.robot, key.number) for key in self._store.keys(Kind.MAP))
 

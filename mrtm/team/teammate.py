@@ -12,7 +12,7 @@ from mrtm.joint.alignment.aligner import Aligner
 from mrtm.joint.joint_map import Component, JointMap
 from mrtm.joint.sightings.consistency import Judgement, Verdict, judge
 from mrtm.joint.sightings.hypotheses import HypothesisId
-from mrtm.team.evidence import Answers, Evidence
+from mrtm.team.evidence import evidence
 from mrtm.team.meeting import anchored, bridges, fusing_edges, sightings
 from mrtm.team.records import EdgeRecord, Key, SightingRecord, VertexRecord
 from mrtm.team.store import R, Store
@@ -30,13 +30,11 @@ class Peers:
     Attributes:
         concluded: what sightings come to, by the hash of the store.
         settled: what all comes to, likewise.
-        answers: of the maps.
     """
 
     def __init__(self) -> None:
         self.concluded: dict[bytes, _Conclusion] = {}
         self.settled: dict[bytes, Teammate] = {}
-        self.answers: Answers = {}
 
 
 GROWN = 1.1  # times as much is known
@@ -76,7 +74,6 @@ class Teammate:
         self._stages = stages
         self._peers = peers
         self._maps = Surfaces(self.store)
-        self._evidence = Evidence(self._maps, self.joint, peers.answers)
         self._fusing: dict[EdgeId, Edge | SightingEdge] = {}
         self._told: dict[Key, int] = {}  # version of each record that the joint map knows
         self._held = b""  # the hash of what was known when sightings were last judged
@@ -173,7 +170,7 @@ class Teammate:
         """What the records say of the sightings, and the edges between robots that follow."""
         graphs = self.joint.robots
         found = {hypothesis.id: hypothesis for hypothesis in sightings(self.store, graphs)}
-        consistency = judge(found.values(), graphs, self._evidence)
+        consistency = judge(found.values(), graphs, evidence(self._maps, graphs))
         believed = [found[key] for key, j in consistency.judgements.items() if j.verdict is Verdict.ACCEPTED]
         edges = fusing_edges(anchored(hypothesis, consistency.slack) for hypothesis in believed)
         return consistency.judgements, [*edges, *bridges(consistency.offsets, edges)]

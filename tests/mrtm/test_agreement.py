@@ -123,14 +123,14 @@ class TestFit:
         true = se2.between(np.array(at_a), np.array(at_b))
         found = fit(corridor(at_a), corridor(at_b), true, HALF)
         assert found.agreement.hits > 0.95
-        assert found.lead < 0.02
+        assert found.lead() < 0.02
         assert found.decision is Decision.UNDECIDED
 
     def test_niches_tell_where_along_a_corridor(self) -> None:
         at_a, at_b = (0.0, 1.0, 0.3), (3.0, 1.5, -0.2)
         walls = CORRIDOR + [(x, y0, x, y1) for x, y0, _, y1 in NICHES for x in np.arange(x, x + 0.3, 0.04)]
         found = fit(corridor(at_a, walls), corridor(at_b, walls), se2.between(np.array(at_a), np.array(at_b)), HALF)
-        assert found.lead > 0.1
+        assert found.lead() > 0.1
 
     def test_a_small_overlap_says_nothing(self) -> None:
         at_a, at_b = (0.0, 1.0, 0.0), (14.0, 1.0, 0.0)

@@ -159,13 +159,13 @@ def counts(a: Lookup, b: Lookup, poses: FloatArray, thinned: int = 1) -> npt.NDA
 def _count(kinds, resolution, origin, points, poses, counts):  # type: ignore[no-untyped-def]
     rows, columns = kinds.shape
     for k in range(len(poses)):
-        c, s = math.cos(poses[k, 2]), math.sin(poses[k, 2])
-        x0, y0 = poses[k, 0] - origin[0], poses[k, 1] - origin[1]
+        c, s = math.cos(poses[k, 2]) / resolution, math.sin(poses[k, 2]) / resolution
+        x0, y0 = (poses[k, 0] - origin[0]) / resolution, (poses[k, 1] - origin[1]) / resolution
         for i in range(len(points)):
-            u = math.floor((x0 + c * points[i, 0] - s * points[i, 1]) / resolution)
-            v = math.floor((y0 + s * points[i, 0] + c * points[i, 1]) / resolution)
-            if 0 <= u < columns and 0 <= v < rows:
-                kind = kinds[v, u]
+            u = x0 + c * points[i, 0] - s * points[i, 1]
+            v = y0 + s * points[i, 0] + c * points[i, 1]
+            if 0.0 <= u < columns and 0.0 <= v < rows:
+                kind = kinds[int(v), int(u)]
                 counts[k, 0] += kind != _UNKNOWN
                 counts[k, 1] += kind == _SURFACE
                 counts[k, 2] += kind == _CLEAR

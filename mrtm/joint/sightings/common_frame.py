@@ -2,24 +2,30 @@
 
 The robots' vertices are the variables, each robot's own map enters as the tree of ``OwnMap``, a sighting as one
 measurement between two vertices. It serves to judge sightings; the joint map itself is iSAM2's.
-
-Solved by SuperLU one right side at a time: Cholesky and triangular solves of OpenBLAS start threads even for small
-matrices, which on a busy machine costs a thousand times the work.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from scipy.sparse import bsr_array, csc_array
-from scipy.sparse.linalg import SuperLU, splu
+from numba import njit
 
 from frontend import se2
+from mrtm.joint.sightings.block_cholesky import (
+    Blocks,
+    factorise,
+    inverse_of_factors,
+    pattern_of,
+    slot,
+    substitute,
+)
 from mrtm.joint.sightings.hypotheses import BoolArray, FloatArray, IntArray, Measurements, OwnMap
-from mrtm.joint.sightings.innovation import innovations
-from mrtm.joint.sightings.selected_inverse import selected_inverse
+from mrtm.joint.sightings.innovation import between, compose, innovation, innovations
 
 _STEPS, _SETTLED = 10, 1e-4
+KEPT = 2**12  # maps
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,21 +34,21 @@ class CommonFrame:
 
     Attributes:
         poses: (m, 3) one row a vertex.
-        covariance: (m, m, 3, 3) of all poses together, each in its own frame; of pairs of vertices only those that the
-            sightings given to ``solve``, whether believed or not, join, and the roots of the robots these join.
+        covariance: of all poses but the first together, each in its own frame; of pairs of vertices only those that
+            the sightings given to ``solve``, whether believed or not, join, and the roots of the robots these join.
     """
 
     poses: FloatArray
-    covariance: FloatArray
+    covariance: Blocks
 
     def predict(self, tail: IntArray, head: IntArray) -> tuple[FloatArray, FloatArray]:
         """tail_T_head (n, 3) and its covariance (n, 3, 3) in the frame of head."""
         relative = se2.between(self.poses[tail], self.poses[head])
         back = adjoint(se2.inverse(relative))
         turned = np.swapaxes(back, -1, -2)
-        p = self.covariance
-        cross = back @ p[tail, head]
-        return relative, back @ p[tail, tail] @ turned + p[head, head] - cross - np.swapaxes(cross, -1, -2)
+        p, u, v = self.covariance, tail - 1, head - 1
+        cross = back @ p.at(u, v)
+        return relative, back @ p.at(u, u) @ turned + p.at(v, v) - cross - np.swapaxes(cross, -1, -2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,32 +73,21 @@ def solve(maps: Sequence[OwnMap], sightings: Measurements, believed: BoolArray, 
     Raises:
         LinAlgError: they do not fix where the maps lie.
     """
-    tails, heads, measured, informations = _own_edges(maps)
+    trees, measured, informations = _own_edges(maps)
     chosen = np.flatnonzero(believed)
     seen = sightings.rows(chosen, np.arange(len(start)))
-    weights = np.linalg.inv(seen.noise)
-    tails, heads = np.concatenate([tails, seen.tail]), np.concatenate([heads, seen.head])
-    poses = start
-    for _ in range(_STEPS):
-        predicted = se2.between(poses[tails], poses[heads])
-        split = len(measured)
-        residual, derivative = innovations(seen, predicted[split:])
-        own = se2.log(se2.between(predicted[:split], measured))
-        turned = np.swapaxes(derivative, -1, -2)
-        information = np.concatenate([informations, turned @ weights @ derivative])
-        gradient = np.concatenate([_times(informations, own), _times(turned @ weights, residual)])
-        matrix, vector = _normal_equations(len(start), tails, heads, predicted, information, gradient)
-        factor = _factorised(matrix)
-        step = np.zeros((len(start), 3))
-        step[1:] = factor.solve(vector[3:]).reshape(-1, 3)
-        poses = se2.compose(poses, exp(step))
-        if np.abs(step).max() < _SETTLED:
-            break
-    m = len(start)
-    covariance = np.zeros((m, m, 3, 3))
+    tails, heads = np.concatenate([trees[:, 0], seen.tail]), np.concatenate([trees[:, 1], seen.head])
     wanted = _asked_about(maps, sightings)
-    covariance[1:, 1:] = selected_inverse(matrix[3:, 3:], (wanted[0] - 1, wanted[1] - 1))
-    if not np.all(np.diagonal(covariance.diagonal(), axis1=0, axis2=1) >= 0.0):  # NaN as well
+    # The first is fixed: nothing of it varies, and the rows of the equations begin with the second.
+    pattern = pattern_of(len(start) - 1, np.concatenate([tails, wanted[0]]) - 1, np.concatenate([heads, wanted[1]]) - 1)
+    poses = start.copy()
+    diagonal, below = np.empty((len(start) - 1, 3, 3)), np.empty((len(pattern.rows), 3, 3))
+    fixed = _gauss_newton(
+        *pattern, tails, heads, measured, informations, seen.full, seen.measured, np.linalg.inv(seen.noise),
+        seen.tail_anchor, seen.head_anchor, poses, diagonal, below,
+    )  # fmt: skip
+    covariance = inverse_of_factors(Blocks(pattern, diagonal, below)) if fixed else None
+    if covariance is None or not (np.diagonal(covariance.diagonal, axis1=1, axis2=2) >= 0.0).all():  # NaN as well
         raise np.linalg.LinAlgError("the sightings do not fix the frames")
     return CommonFrame(poses, covariance)
 
@@ -102,8 +97,7 @@ def _asked_about(maps: Sequence[OwnMap], sightings: Measurements) -> IntArray:
     sizes = [len(own.vertices) for own in maps]
     roots = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes)
     ends = np.stack([sightings.tail, sightings.head])
-    both = np.unique(np.concatenate([ends, roots[ends]], axis=1), axis=1)
-    return both[:, (both > 0).all(axis=0)]  # the first is fixed: nothing of it varies
+    return np.concatenate([ends, roots[ends]], axis=1)
 
 
 def examine(frame: CommonFrame, sightings: Measurements, believed: BoolArray) -> Examination:
@@ -120,7 +114,7 @@ def examine(frame: CommonFrame, sightings: Measurements, believed: BoolArray) ->
     values, vectors = np.linalg.eigh(white)
     alone = values[:, 0] < _ALONE
     values = np.maximum(values, _ALONE)
-    r = _times(np.swapaxes(vectors, -1, -2), np.linalg.solve(scale, residual[:, :, None])[:, :, 0])
+    r = (np.swapaxes(vectors, -1, -2) @ np.linalg.solve(scale, residual[:, :, None]))[:, :, 0]
     power = np.where(believed, -0.5, 0.5)
     spread = np.prod(np.diagonal(scale, axis1=1, axis2=2), axis=1) * np.prod(values ** power[:, None], axis=1)
     return Examination(np.sum(r * r / values, axis=1), np.where(alone, np.inf, spread))
@@ -139,52 +133,111 @@ def adjoint(poses: FloatArray) -> FloatArray:
     return matrix
 
 
-def exp(tangents: FloatArray) -> FloatArray:
-    """(..., 3) poses of tangent vectors, the inverse of ``frontend.se2.log``."""
-    theta = tangents[..., 2]
-    a, b = np.sinc(theta / np.pi), 0.5 * theta * np.sinc(0.5 * theta / np.pi) ** 2
-    x, y = tangents[..., 0], tangents[..., 1]
-    return np.stack([a * x - b * y, b * x + a * y, se2.wrap(theta)], axis=-1)
+def _own_edges(maps: Sequence[OwnMap]) -> tuple[IntArray, FloatArray, FloatArray]:
+    """The tree edges of all maps: rows of tail and head, measured pose, information in the frame of the head."""
+    sizes = [len(own.vertices) for own in maps]
+    trees = [own.tree + first for own, first in zip(maps, np.cumsum([0, *sizes[:-1]]).tolist(), strict=True)]
+    measured, informations = zip(*map(_tree_edges, maps), strict=True)
+    return np.concatenate(trees), np.concatenate(measured), np.concatenate(informations)
 
 
-def _own_edges(maps: Sequence[OwnMap]) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """The tree edges of all maps: tail and head rows, measured pose, information in the frame of the head."""
-    trees, measured, covariances = [], [], []
-    first = 0
-    for own in maps:
-        trees.append(own.tree + first)
-        measured.append(own.relative[own.tree[:, 0], own.tree[:, 1]])
-        covariances.append(own.covariances[own.tree[:, 0], own.tree[:, 1]])
-        first += len(own.vertices)
-    tree = np.concatenate(trees)
-    return tree[:, 0], tree[:, 1], np.concatenate(measured), np.linalg.inv(np.concatenate(covariances))
+@lru_cache(KEPT)
+def _tree_edges(own: OwnMap) -> tuple[FloatArray, FloatArray]:
+    at = own.tree[:, 0], own.tree[:, 1]
+    return own.relative[at], np.asarray(np.linalg.inv(own.covariances[at]), np.float64)
 
 
-def _normal_equations(
-    m: int, tails: IntArray, heads: IntArray, predicted: FloatArray, information: FloatArray, gradient: FloatArray
-) -> tuple[csc_array, FloatArray]:
-    """(3m, 3m) matrix and (3m,) vector; a step of the head counts as it is, one of the tail as seen from the head."""
-    back = -adjoint(se2.inverse(predicted))
-    turned = np.swapaxes(back, -1, -2)
-    mixed = turned @ information
-    rows, columns = np.concatenate([tails, heads, tails, heads]), np.concatenate([tails, heads, heads, tails])
-    blocks = np.concatenate([mixed @ back, information, mixed, np.swapaxes(mixed, -1, -2)])
-    order = np.argsort(rows, kind="stable")
-    starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=m))])
-    matrix = bsr_array((blocks[order], columns[order], starts), shape=(3 * m, 3 * m)).tocsc()
-    vector = np.zeros((m, 3))
-    np.add.at(vector, tails, _times(turned, gradient))
-    np.add.at(vector, heads, gradient)
-    return matrix, vector.reshape(-1)
+@njit(cache=True)
+def _gauss_newton(  # type: ignore[no-untyped-def]
+    place, starts, rows, tails, heads, own, own_information, full, measured, weights, tail_anchor, head_anchor,
+    poses, diagonal, below,
+):  # fmt: skip
+    """Leave the ``poses`` at the optimum, and the factors of the last matrix; False if it is singular."""
+    split = len(own)
+    vector, step = np.empty((len(diagonal), 3)), np.empty(3)
+    predicted, pose, r, g = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    h, information, mixed, back = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for _ in range(_STEPS):
+        diagonal[:], below[:], vector[:] = 0.0, 0.0, 0.0
+        for e in range(len(tails)):
+            between(poses[tails[e]], poses[heads[e]], predicted)
+            if e < split:
+                innovation(True, own[e], predicted, predicted, predicted, pose, r, h)
+                information[:] = own_information[e]
+                _times(information, r, g)
+            else:
+                j = e - split
+                innovation(full[j], measured[j], tail_anchor[j], head_anchor[j], predicted, pose, r, h)
+                _turned_product(h, weights[j], mixed)
+                _product(mixed, h, information)
+                _times(mixed, r, g)
+            # A step of the head counts as it is, one of the tail as seen from the head.
+            tail, head = tails[e] - 1, heads[e] - 1
+            _back(predicted, back)
+            if head >= 0:
+                diagonal[place[head]] += information
+                vector[place[head]] += g
+            if tail >= 0:
+                _turned_product(back, information, mixed)
+                _product(mixed, back, h)
+                diagonal[place[tail]] += h
+                for a in range(3):
+                    for b in range(3):
+                        vector[place[tail], a] += back[b, a] * g[b]
+                if head >= 0 and place[tail] > place[head]:
+                    below[slot(starts, rows, place[tail], place[head])] += mixed
+                elif head >= 0:
+                    below[slot(starts, rows, place[head], place[tail])] += mixed.T
+        if not factorise(starts, rows, diagonal, below):
+            return False
+        substitute(starts, rows, diagonal, below, vector)
+        largest = 0.0
+        for i in range(len(diagonal)):
+            largest = max(largest, np.abs(vector[place[i]]).max())
+            exp(vector[place[i]], step)
+            compose(poses[i + 1], step, poses[i + 1])
+        if largest < _SETTLED:
+            break
+    return True
 
 
-def _factorised(matrix: csc_array) -> SuperLU:
-    """The factors of the matrix without the fixed pose."""
-    try:
-        return splu(matrix[3:, 3:], permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-    except RuntimeError as error:  # exactly singular
-        raise np.linalg.LinAlgError(str(error)) from error
+@njit(cache=True)
+def exp(tangent, out):  # type: ignore[no-untyped-def]
+    """The pose of a tangent vector, the inverse of ``frontend.se2.log``."""
+    theta = tangent[2]
+    half = 0.5 * theta
+    sinc = math.sin(half) / half if abs(half) > 1e-9 else 1.0
+    a, b = sinc * math.cos(half), half * sinc * sinc
+    out[0], out[1], out[2] = a * tangent[0] - b * tangent[1], b * tangent[0] + a * tangent[1], theta
 
 
-def _times(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
+@njit(cache=True)
+def _back(pose, out):  # type: ignore[no-untyped-def]
+    """-Ad(pose^-1)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x = -(c * pose[0] + s * pose[1])
+    y = s * pose[0] - c * pose[1]
+    out[0, 0], out[0, 1], out[0, 2] = -c, -s, -y
+    out[1, 0], out[1, 1], out[1, 2] = s, -c, x
+    out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, -1.0
+
+
+@njit(cache=True)
+def _product(a, b, out):  # type: ignore[no-untyped-def]
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = a[r, 0] * b[0, c] + a[r, 1] * b[1, c] + a[r, 2] * b[2, c]
+
+
+@njit(cache=True)
+def _turned_product(a, b, out):  # type: ignore[no-untyped-def]
+    """a' b."""
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = a[0, r] * b[0, c] + a[1, r] * b[1, c] + a[2, r] * b[2, c]
+
+
+@njit(cache=True)
+def _times(a, v, out):  # type: ignore[no-untyped-def]
+    for r in range(3):
+        out[r] = a[r, 0] * v[0] + a[r, 1] * v[1] + a[r, 2] * v[2]

@@ -68,7 +68,7 @@ def _wrap(angle):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _compose(a, b, out):  # type: ignore[no-untyped-def]
+def compose(a, b, out):  # type: ignore[no-untyped-def]
     c, s = math.cos(a[2]), math.sin(a[2])
     x, y = a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1]
     out[2] = _wrap(a[2] + b[2])
@@ -76,7 +76,7 @@ def _compose(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _between(a, b, out):  # type: ignore[no-untyped-def]
+def between(a, b, out):  # type: ignore[no-untyped-def]
     c, s = math.cos(a[2]), math.sin(a[2])
     dx, dy = b[0] - a[0], b[1] - a[1]
     out[2] = _wrap(b[2] - a[2])
@@ -115,16 +115,16 @@ def _carry(pose, covariance, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _innovation(full, measured, tail_anchor, head_anchor, predicted, pose, r, h):  # type: ignore[no-untyped-def]
+def innovation(full, measured, tail_anchor, head_anchor, predicted, pose, r, h):  # type: ignore[no-untyped-def]
     if full:
-        _between(predicted, measured, pose)
+        between(predicted, measured, pose)
         _log(pose, r)
         h[:] = 0.0
         h[0, 0] = h[1, 1] = h[2, 2] = 1.0
         return
-    _between(tail_anchor, predicted, pose)
+    between(tail_anchor, predicted, pose)
     turn = pose[2]
-    _compose(pose, head_anchor, pose)
+    compose(pose, head_anchor, pose)
     r[0], r[1], r[2] = measured[0] - pose[0], measured[1] - pose[1], 0.0
     # A step (x, y, theta) of the head vertex moves the robot in it by (x - theta b, y + theta a), in the vertex' frame.
     c, s = math.cos(turn), math.sin(turn)
@@ -138,9 +138,7 @@ def _innovation(full, measured, tail_anchor, head_anchor, predicted, pose, r, h)
 def _innovations(full, measured, tail_anchor, head_anchor, predicted, residual, derivative):  # type: ignore[no-untyped-def]
     pose = np.empty(3)
     for j in range(len(full)):
-        _innovation(
-            full[j], measured[j], tail_anchor[j], head_anchor[j], predicted[j], pose, residual[j], derivative[j]
-        )
+        innovation(full[j], measured[j], tail_anchor[j], head_anchor[j], predicted[j], pose, residual[j], derivative[j])
 
 
 @njit(cache=True)
@@ -183,12 +181,12 @@ def _votes(  # type: ignore[no-untyped-def]
                 z[:], cz[:] = offset[i], offset_covariance[i]
                 if (near < first) != (last_tail < first):
                     near, far = far, near
-                    _between(offset[i], origin, z)
+                    between(offset[i], origin, z)
                     _carry(z, offset_covariance[i], cz)
-                _compose(relative[last_tail, near], z, w)
+                compose(relative[last_tail, near], z, w)
                 _carry(z, covariances[last_tail, near], ct)
                 ct += cz
-                _compose(w, relative[far, last_head], t)
+                compose(w, relative[far, last_head], t)
                 _carry(relative[far, last_head], ct, s)
                 ct[:] = s + covariances[far, last_head]
             if full[j]:
@@ -196,10 +194,10 @@ def _votes(  # type: ignore[no-untyped-def]
                 if turn * turn > GATE_FULL * (ct[2, 2] + noise[j, 2, 2]):
                     chi2[i, j] = np.inf
                     continue
-                _innovation(True, measured[j], tail_anchor[j], head_anchor[j], t, pose, r, h)
+                innovation(True, measured[j], tail_anchor[j], head_anchor[j], t, pose, r, h)
                 s[:] = ct + noise[j]
             else:
-                _innovation(False, measured[j], tail_anchor[j], head_anchor[j], t, pose, r, h)
+                innovation(False, measured[j], tail_anchor[j], head_anchor[j], t, pose, r, h)
                 for p in range(3):
                     for q in range(3):
                         hc[p, q] = h[p, 0] * ct[0, q] + h[p, 1] * ct[1, q] + h[p, 2] * ct[2, q]

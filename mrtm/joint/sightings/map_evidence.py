@@ -13,7 +13,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from factors import UncertainPose, VertexId, compose, inverse
+from factors import UncertainPose, VertexId
 from frontend import se2
 from mrtm.joint.alignment.agreement import (
     LEAST_POINTS,
@@ -26,6 +26,7 @@ from mrtm.joint.alignment.agreement import (
     overlap,
     scores,
 )
+from mrtm.joint.sightings.common_frame import adjoint
 from mrtm.joint.sightings.hypotheses import RobotGraph, coordinates
 
 LEAST_OVERLAP = 20.0
@@ -48,8 +49,11 @@ WIDEST = (1.2, 0.25)
 
 KEPT = 2**14  # answers
 
+NEAREST = 6
+"""Pairs of local maps that are looked at, those whose vertices lie nearest to each other."""
+
 MOST_PAIRS = 3
-"""Pairs of local maps that are compared, those that overlap most."""
+"""Pairs of them that are compared, those that overlap most."""
 
 _THINNED = 4  # one point in so many gives a score to about
 _ROUGHLY = 0.1
@@ -61,15 +65,12 @@ _SHIFTS = np.arange(0.6, 4.01, 0.2)
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Two local maps at the pose that fits best: a_T_b (3,), how they agree there, and how clearly.
+    """Two local maps ``a`` and ``b`` at the ``pose`` a_T_b (3,) that fits best, and how they agree there."""
 
-    Attributes:
-        lead: score there less the best score with one map moved along.
-    """
-
+    a: Lookup
+    b: Lookup
     pose: FloatArray
     agreement: Agreement
-    lead: float
 
     @property
     def decision(self) -> Decision:
@@ -80,7 +81,20 @@ class Fit:
         if found.hits <= CONTRADICTING[0] and found.conflicts >= CONTRADICTING[1]:
             return Decision.CONTRADICTS
         agrees = found.hits >= AGREEING[0] and found.conflicts <= AGREEING[1]
-        return Decision.AGREES if agrees and self.lead >= UNIQUE else Decision.UNDECIDED
+        return Decision.AGREES if agrees and self.lead() >= UNIQUE else Decision.UNDECIDED
+
+    def lead(self) -> float:
+        """How clearly they fit: the score there less the best score with one map moved along, which takes long."""
+        a, b, pose = self.a, self.b, self.pose
+        axis = _weak_direction(a, b, pose)
+        way = np.concatenate([_SHIFTS, -_SHIFTS])
+        moved = []
+        for angle in (axis, axis + 0.5 * np.pi):
+            shift = np.outer(way, [np.cos(angle), np.sin(angle), 0.0])
+            moved.append(se2.compose((pose + shift)[:, None], _around(_FINE, 0.1, 0.02)[None]).reshape(-1, 3))
+        # Moved sideways two corridors touch wall to wall, which is no overlap: that leaves few of the points.
+        elsewhere = _best_score(a, b, np.concatenate(moved), max(LEAST_POINTS, self.agreement.points // 2))
+        return float(scores(a, b, pose[None])[0] - elsewhere)
 
 
 def fit(a: Lookup, b: Lookup, guess: FloatArray, half: FloatArray) -> Fit:
@@ -91,16 +105,7 @@ def fit(a: Lookup, b: Lookup, guess: FloatArray, half: FloatArray) -> Fit:
         score = scores(a, b, tried, thinned=thinned)
         if score.max() > scores(a, b, pose[None], thinned=thinned)[0]:
             pose = tried[int(np.argmax(score))]
-    axis = _weak_direction(a, b, pose)
-    way = np.concatenate([_SHIFTS, -_SHIFTS])
-    moved = []
-    for angle in (axis, axis + 0.5 * np.pi):
-        shift = np.outer(way, [np.cos(angle), np.sin(angle), 0.0])
-        moved.append(se2.compose((pose + shift)[:, None], _around(_FINE, 0.1, 0.02)[None]).reshape(-1, 3))
-    here = agreement(a, b, pose)
-    # Moved sideways two corridors touch wall to wall, which is no overlap: that leaves few of the points.
-    elsewhere = _best_score(a, b, np.concatenate(moved), max(LEAST_POINTS, here.points // 2))
-    return Fit(pose, here, float(scores(a, b, pose[None])[0] - elsewhere))
+    return Fit(a, b, pose, agreement(a, b, pose))
 
 
 def _best_score(a: Lookup, b: Lookup, poses: FloatArray, least: int) -> float:
@@ -113,44 +118,69 @@ class MapEvidence:
     """The word of the local maps, as :func:`mrtm.joint.sightings.consistency.judge` asks for it.
 
     Args:
-        maps: of all robots, ready for comparison.
-        graphs: each robot's own, by name, with all vertices that have a map.
+        maps: of all robots, ready for comparison, all at vertices that the graphs have; only those are looked at that
+            are to be compared.
+        graphs: each robot's own, by name.
     """
 
     def __init__(self, maps: Mapping[VertexId, Lookup], graphs: Mapping[str, RobotGraph]) -> None:
         self._maps, self._graphs = maps, graphs
+        self._owned: dict[str, tuple[VertexId, ...]] = {}
+        for vertex in sorted(maps):
+            self._owned[vertex.robot] = (*self._owned.get(vertex.robot, ()), vertex)
 
-    def __call__(self, tail: VertexId, head: VertexId, tail_T_head: UncertainPose) -> Decision:
-        """What the maps of two robots say if ``head`` lies there: one contradiction outweighs any agreement."""
-        overlaps = []
-        heads = self._seen_from(head)
-        if not heads:
+    def __call__(self, tail: VertexId, head: VertexId, tail_T_head: UncertainPose, veto: bool = False) -> Decision:
+        """What the maps of two robots say if ``head`` lies there: one contradiction outweighs any agreement.
+
+        Args:
+            veto: whether only a contradiction matters; then no agreement is looked for.
+        """
+        ours, theirs = (self._owned.get(end.robot, ()) for end in (tail, head))
+        if not (ours and theirs):
             return Decision.UNDECIDED
-        poses = np.array([coordinates(head_T_v.pose) for _, head_T_v in heads])
-        carry = np.array([head_T_v.pose.inverse().AdjointMap() for _, head_T_v in heads])
-        covariances = np.array([head_T_v.covariance for _, head_T_v in heads])
-        for u, tail_T_u in self._seen_from(tail):
-            u_T_head = compose(inverse(tail_T_u), tail_T_head)
-            seen = se2.compose(np.array(coordinates(u_T_head.pose)), poses)
-            spread = carry @ u_T_head.covariance @ carry.transpose(0, 2, 1) + covariances
-            sigma = np.sqrt(spread.diagonal(axis1=1, axis2=2))
-            sure = (sigma[:, :2].max(axis=1) < WIDEST[0] / SIGMAS) & (sigma[:, 2] < WIDEST[1] / SIGMAS)
-            for place in np.flatnonzero(sure):
-                v, question = heads[place][0], _question(seen[place], sigma[place])
-                overlaps.append((_overlap(self._maps[u], self._maps[v], question), u, v, question))
+        overlaps = []
+        near_tail = _seen_from(self._graphs[tail.robot], tail, ours)
+        seen, sigma = _between(near_tail, tail_T_head, _seen_from(self._graphs[head.robot], head, theirs))
+        sure = (sigma[..., :2].max(axis=-1) < WIDEST[0] / SIGMAS) & (sigma[..., 2] < WIDEST[1] / SIGMAS)
+        near = np.where(sure, np.hypot(seen[..., 0], seen[..., 1]), np.inf).ravel()
+        for place in np.argsort(near, kind="stable")[:NEAREST]:
+            if not np.isfinite(near[place]):
+                break
+            i, k = np.unravel_index(place, sure.shape)
+            u, v, question = ours[i], theirs[k], _question(seen[i, k], sigma[i, k])
+            overlaps.append((_overlap(self._maps[u], self._maps[v], question), u, v, question))
         overlaps.sort(key=lambda o: (-o[0], o[1], o[2]))
         said = {
             _decision(self._maps[u], self._maps[v], question)
             for area, u, v, question in overlaps[:MOST_PAIRS]
-            if area >= LEAST_OVERLAP
+            if area >= LEAST_OVERLAP and not (veto and _fits_well(self._maps[u], self._maps[v], question))
         }
         return next((word for word in (Decision.CONTRADICTS, Decision.AGREES) if word in said), Decision.UNDECIDED)
 
-    def _seen_from(self, vertex: VertexId) -> list[tuple[VertexId, UncertainPose]]:
-        """The vertices of a robot that have a map, and where each lies, seen from one of the robot's vertices."""
-        graph, here = self._graphs[vertex.robot], UncertainPose(gtsam.Pose2(), np.zeros((3, 3)))
-        owned = sorted(v for v in self._maps if v.robot == vertex.robot)
-        return [(v, here if v == vertex else graph.relative(vertex, v)) for v in owned]
+
+class _Around(NamedTuple):
+    """Where n vertices of a robot lie, seen from one of them: ``poses`` (n, 3) and their ``covariances`` (n, 3, 3)."""
+
+    poses: FloatArray
+    covariances: FloatArray
+
+
+@lru_cache(512)
+def _seen_from(graph: RobotGraph, vertex: VertexId, others: tuple[VertexId, ...]) -> _Around:
+    here = UncertainPose(gtsam.Pose2(), np.zeros((3, 3)))
+    seen = [here if v == vertex else graph.relative(vertex, v) for v in others]
+    return _Around(np.array([coordinates(s.pose) for s in seen]), np.array([s.covariance for s in seen]))
+
+
+def _between(ours: _Around, tail_T_head: UncertainPose, theirs: _Around) -> tuple[FloatArray, FloatArray]:
+    """The poses (n, k, 3) of their vertices seen from ours, and their standard deviations (n, k, 3)."""
+    u_T_head = se2.between(ours.poses, np.array(coordinates(tail_T_head.pose)))
+    back = adjoint(se2.inverse(u_T_head))
+    at_head = back @ ours.covariances @ np.swapaxes(back, -1, -2) + tail_T_head.covariance
+    back = adjoint(se2.inverse(theirs.poses))
+    at_v = back @ at_head[:, None] @ np.swapaxes(back, -1, -2) + theirs.covariances
+    seen = se2.compose(u_T_head[:, None], theirs.poses[None])
+    return seen, np.sqrt(np.diagonal(at_v, axis1=-2, axis2=-1))
 
 
 class _Question(NamedTuple):
@@ -169,6 +199,11 @@ def _question(pose: FloatArray, sigma: FloatArray) -> _Question:
 @lru_cache(KEPT)
 def _overlap(a: Lookup, b: Lookup, question: _Question) -> float:
     return overlap(a, b, np.array(question.pose))
+
+
+def _fits_well(a: Lookup, b: Lookup, question: _Question) -> bool:
+    """Whether two maps agree too well to contradict each other already where the fit begins, which makes it better."""
+    return bool(scores(a, b, np.array([question.pose]))[0] > CONTRADICTING[0] - CONTRADICTING[1])
 
 
 @lru_cache(KEPT)

@@ -13,8 +13,9 @@ from mrtm.joint.alignment.agreement import Decision
 from mrtm.joint.sightings.consensus import Candidate, candidates
 from mrtm.joint.sightings.hypotheses import BoolArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
 
-Evidence = Callable[[VertexId, VertexId, UncertainPose], Decision]
-"""What the local maps around two vertices of different robots say of a pose tail_T_head."""
+Evidence = Callable[[VertexId, VertexId, UncertainPose, bool], Decision]
+"""What the local maps around two vertices of different robots say of a pose tail_T_head. The last argument tells that
+nothing matters but whether they contradict it: that is found a hundred times faster."""
 
 LEAST_SUPPORT = 4
 """Sightings that must agree: two or three false ones that agree by chance or by one common fault defeat any method."""
@@ -100,10 +101,10 @@ def find(proposed: Proposed, evidence: Evidence | None) -> Finding:
     sets = list(islice(stream, 2))
     vetoed: list[Candidate] = []
 
-    def look(candidate: Candidate) -> Decision:
+    def look(candidate: Candidate, veto: bool) -> Decision:
         if evidence is None:
             return Decision.UNDECIDED
-        return evidence(*_where(candidate, proposed.sightings, proposed.vertices, proposed.split))
+        return evidence(*_where(candidate, proposed.sightings, proposed.vertices, proposed.split), veto)
 
     while sets[len(vetoed) :]:
         best, rest = sets[len(vetoed)], sets[len(vetoed) + 1 :]
@@ -111,7 +112,7 @@ def find(proposed: Proposed, evidence: Evidence | None) -> Finding:
         enough = best.support >= LEAST_SUPPORT and best.surplus >= LEAST_SURPLUS
         if not (enough and outnumbers(best.support, rival)):
             break
-        if look(best) is not Decision.CONTRADICTS:
+        if look(best, veto=True) is not Decision.CONTRADICTS:
             return Finding(tuple(sets), best, False, tuple(vetoed), rival, proposed.split)
         vetoed.append(best)
         sets.extend(islice(stream, 1))
@@ -122,7 +123,7 @@ def find(proposed: Proposed, evidence: Evidence | None) -> Finding:
     more = list(islice(stream, MOST_LOOKS - len(looked) + 1))
     sets, looked = sets + more, (looked + more)[:MOST_LOOKS]
     unseen = max((s.support for s in sets[len(vetoed) + len(looked) :]), default=0)
-    said = [look(candidate) for candidate in looked]
+    said = [look(candidate, veto=False) for candidate in looked]
     agreeing = [candidate for candidate, word in zip(looked, said, strict=True) if word is Decision.AGREES]
     vetoed += [candidate for candidate, word in zip(looked, said, strict=True) if word is Decision.CONTRADICTS]
     lifted = len(agreeing) == 1 and agreeing[0].support > unseen
