@@ -166,6 +166,12 @@ class TestMapEvidence:
     def test_it_contradicts_what_is_wrong(self) -> None:
         assert self.asked((2.0, 1.0, 0.6)) is Decision.CONTRADICTS
 
+    @pytest.mark.parametrize(("off", "contradicted"), [((0.15, -0.1, 0.02), False), ((2.0, 1.0, 0.6), True)])
+    def test_a_veto_alone_is_the_same_contradiction(self, off: tuple[float, float, float], contradicted: bool) -> None:
+        seen = UncertainPose(gtsam.Pose2(*A_T_B).compose(gtsam.Pose2(*off)), np.diag([0.1, 0.1, 0.02]) ** 2)
+        said = self.evidence()(VertexId("red", 0), VertexId("blue", 0), seen, veto=True)
+        assert (said is Decision.CONTRADICTS) is contradicted
+
     def test_it_says_nothing_where_the_pose_is_too_uncertain(self) -> None:
         assert self.asked((2.0, 1.0, 0.6), sigma=1.0) is Decision.UNDECIDED
 
