@@ -75,6 +75,7 @@ class Smoother:
         self._factorization = "CHOLESKY"
         self._values: gtsam.Values | None = None
         self._seen_from: dict[int, gtsam.ISAM2] = {}
+        self._settled = False  # nothing has moved since all that had moved was linearised anew
         self._waited = 0  # updates since one that linearised a portion anew
         self._behind = False  # whether that left some for the next
         self._start(factors, values)
@@ -108,7 +109,8 @@ class Smoother:
         """Linearise anew until nothing is left to be; of a large graph once all that has moved by 3 mm or 3 mrad."""
         exact = self._tolerance is _EXACT
         for _ in range(_MAX_STEPS if exact else 1):
-            if self._solve(lambda: self._insert({}, gtsam.Values(), (), None)) == 0:
+            if self._settled or self._solve(lambda: self._insert({}, gtsam.Values(), (), None)) == 0:
+                self._settled = exact
                 return
         if exact:
             self.refine()
@@ -239,6 +241,7 @@ class Smoother:
             top = gtsam.KeyGroupMap()
             top.insert2(max(next(iter(add.values())).keys()), 1)
             change.constrainedKeys = top
+        self._settled = False
         result = self._isam.update(graph, values, change)
         new = dict(zip(add, result.getNewFactorsIndices(), strict=True))
         if (most := max(new.values(), default=0)) >= len(self._kernels):  # doubled: a slot more costs nothing
