@@ -20,9 +20,7 @@ REACH = 0.15  # metres between the points of a pair
 PATCH = 1.5  # metres of a wall that share an error
 POINT, COMMON = 0.005, 0.003  # metres: least standard deviation of a point's own error, and of a patch's
 NORMAL_NOISE = 0.01  # variance of a normal's direction, rad^2: makes a bare wall seem to say something along itself
-# Calibrated on simulated pairs in six kinds of buildings (tools/alignment.py shows the NEES):
-DRAWN = 0.5  # of the covariance of a pose that scans were drawn at: what lies there was drawn at several
-FLOOR = 0.003  # metres: of every alignment, for slips within a map
+FLOOR = 0.003  # metres: of every alignment, for slips within a map; from simulated pairs in six kinds of buildings
 NEARBY = 3.0  # metres: places of a map within this tell the same of its error
 
 
@@ -87,12 +85,16 @@ def _weights(residuals: FloatArray, patch: npt.NDArray[np.int64]) -> FloatArray:
 
 
 def _drift(bends: Bends, point: FloatArray) -> FloatArray:
-    """(3, 3) covariance, in the map's frame, of what lies at ``point`` against the map's origin: of the places near."""
+    """(3, 3) covariance, in the map's frame, of what lies at ``point`` against the map's origin: of the places near.
+
+    All of it, though what was drawn at several places errs less: the edges between the maps and their other alignments
+    have the same error, which the graph takes for independent.
+    """
     if not len(bends.places):
         return np.zeros((3, 3))
     weights = 1.0 / (NEARBY**2 + np.square(bends.places - point).sum(axis=1)) ** 2
     values, vectors = np.linalg.eigh(np.average(bends.covariances, axis=0, weights=weights))
-    return np.asarray(DRAWN * (vectors * np.maximum(values, 0.0)) @ vectors.T)  # rounding may have made it indefinite
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)  # rounding may have made it indefinite
 
 
 def _adjoint(a_T_b: FloatArray) -> FloatArray:
