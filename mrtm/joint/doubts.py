@@ -42,6 +42,9 @@ LOOKED = 128  # doubted edges that a new doubted one is held against, the latest
 ROUNDS = 8  # of edges that come in and go out after a change, beside the new ones
 NEARER = 0.5  # of the chi2 that a doubted edge had when it was judged, for it to be judged again
 
+GROWN = 1.5
+"""Times as many must agree for another look at a set of doubted edges: it takes the whole graph."""
+
 SLIP = 100.0
 """chi2 by which edges that agree may strain those that cannot be false, beside their own noise: the robot may have
 slipped along a wall by ten times what it thinks. Look-alike places are farther apart."""
@@ -54,6 +57,7 @@ class Doubts:
 
     def __init__(self) -> None:
         self._agreeing: defaultdict[EdgeId, set[EdgeId]] = defaultdict(set)
+        self._failed: dict[EdgeId, int] = {}  # size of the last set of doubted edges with it that could not come in
         self._next = 0  # place among all edges of the next believed one to be checked
 
     def settle(self, equations: Equations, new: Collection[EdgeId]) -> None:
@@ -106,8 +110,11 @@ class Doubts:
                 self._agreeing[i].add(j)
                 self._agreeing[j].add(i)
             members = clique(i, self._agreeing, equations.doubted)
-            if len(members) >= LEAST_SUPPORT and (went := _contradicted(equations, members)) is not None:
+            if len(members) < max(LEAST_SUPPORT, *(GROWN * self._failed.get(j, 0) for j in members)):
+                continue
+            if (went := _contradicted(equations, members)) is not None:
                 return [*members, *went]
+            self._failed.update(dict.fromkeys(members, len(members)))
         return []
 
     def _put_out(self, equations: Equations, suspects: Iterable[EdgeId]) -> list[EdgeId]:
