@@ -64,6 +64,16 @@ def mean_and_covariance(poses: FloatArray, weights: FloatArray) -> tuple[FloatAr
     return mean, (tangent * weights[:, None]).T @ tangent
 
 
+def adjoint(poses: FloatArray) -> FloatArray:
+    """(..., 3, 3) Ad of (..., 3) poses: takes tangent vectors from the frame after the pose to the one before it."""
+    c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    matrix = np.zeros((*poses.shape, 3))
+    matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2] = c, -s, poses[..., 1]
+    matrix[..., 1, 0], matrix[..., 1, 1], matrix[..., 1, 2] = s, c, -poses[..., 0]
+    matrix[..., 2, 2] = 1.0
+    return matrix
+
+
 def _exp(tangent: FloatArray) -> FloatArray:
     theta = float(tangent[2])
     if abs(theta) < 1e-6:

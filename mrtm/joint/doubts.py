@@ -3,10 +3,11 @@
 An edge that says what the estimate says already is believed. So is one that its uncertainty explains, where the
 estimate is sure enough to tell a true edge from a false one; any other is doubted: it is known, and without effect. It
 is judged again when the estimate has come nearer. Several doubted edges that agree with each other come in together,
-if they strain nothing that cannot be false, and put out those fewer ones that they contradict. Whatever believed edge
-the estimate then contradicts is doubted again.
+if they strain what cannot be false by no more than a slip, and put out those fewer ones that they contradict. Whatever
+believed edge the estimate then contradicts is doubted again.
 
-The work for a change is bounded, however many edges there are.
+How many edges a change has looked at is bounded, but for sets that are to come in together: those are held against the
+whole graph.
 """
 
 import math
@@ -17,10 +18,11 @@ from itertools import islice
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from factors import FULL_WEIGHT, EdgeId, EdgeKind, GraphEdge
+from factors import FULL_WEIGHT, EdgeId, GraphEdge
 from factors.noise import FloatArray
 from mrtm.joint.agreeing import agreeing, clique
-from mrtm.joint.equations import CERTAIN, Equations
+from mrtm.joint.equations import CERTAIN, FUSED, Equations
+from mrtm.joint.sightings.innovation import share_passing
 from mrtm.joint.sightings.pairs import LEAST_SUPPORT, outnumbers
 
 GATE = {2: 26.99, 3: 30.0}
@@ -48,8 +50,6 @@ GROWN = 1.5
 SLIP = 100.0
 """chi2 by which edges that agree may strain those that cannot be false, beside their own noise: the robot may have
 slipped along a wall by ten times what it thinks. Look-alike places are farther apart."""
-
-_FALSE_AREA = math.pi * 10.0**2
 
 
 class Doubts:
@@ -140,13 +140,10 @@ class Doubts:
 
 
 def chance(covariance: FloatArray) -> float:
-    """Share of random false edges that would pass the gate, given the (n, n) covariance of their innovation.
-
-    The volume of the gate over that of where they may lie.
-    """
+    """Share of random false edges that would pass the gate, given the (n, n) covariance of their innovation."""
     n = len(covariance)
-    ball = math.pi * GATE[2] if n == 2 else 4.0 / 3.0 * math.pi * GATE[3] ** 1.5 / (2.0 * math.pi)
-    return ball * math.sqrt(max(0.0, float(np.linalg.det(covariance)))) / _FALSE_AREA
+    spread = np.sqrt(np.maximum(np.linalg.det(covariance), 0.0))
+    return float(share_passing(spread, np.array(n == 3), np.array(GATE[n])))
 
 
 def _agree(chi2: float, covariance: FloatArray) -> bool:
@@ -161,7 +158,7 @@ def _is_told_true(equations: Equations, edge: GraphEdge) -> bool:
     chi2, covariance = equations.innovation(edge)
     if chi2 > GATE[len(covariance)]:
         return False
-    passing = 0.0 if edge.kind in (EdgeKind.FUSING, EdgeKind.SIGHTING) else chance(covariance)
+    passing = 0.0 if edge.kind in FUSED else chance(covariance)
     return passing < ALLOWED or passing * _share_of_false(equations) < ALLOWED
 
 

@@ -13,6 +13,9 @@ from mrtm.joint.smoother import Smoother
 CERTAIN = {EdgeKind.INTER_VERTEX, EdgeKind.COVARIANCE_INTERSECTION}
 """Kinds of edges that cannot be false: where the robot went from one vertex to the next it was there all the time."""
 
+FUSED = {EdgeKind.FUSING, EdgeKind.SIGHTING}
+"""Kinds that sightings make, of which those that may be false were left out with care (``mrtm.joint.sightings``)."""
+
 
 class Equations:
     """A graph while it is changed; everything given is the graph's own and changes with it.

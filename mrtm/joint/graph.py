@@ -369,13 +369,14 @@ class JointGraph:
     def _needed(self) -> list[GraphEdge]:
         """Doubted edges, which are so no longer, without which vertices would be cut off."""
         needed: list[GraphEdge] = []
+        lost = cut_off(self._vertices_but_root(), self._believed())
         for edge in [self._edges[i] for i in self._doubted]:
-            lost = cut_off(self._vertices_but_root(), self._believed())
             if not lost:
                 break
             if (edge.tail in lost) != (edge.head in lost) and edge.estimate is not None:
                 del self._doubted[edge.id]
                 needed.append(edge)
+                lost = cut_off(self._vertices_but_root(), self._believed())
         return needed
 
     def _believed(self) -> Iterator[GraphEdge]:

@@ -5,12 +5,10 @@ from dataclasses import dataclass, field
 
 import gtsam
 
-from factors import Edge, EdgeId, EdgeKind, GraphEdge, VertexId
+from factors import Edge, EdgeId, GraphEdge, VertexId
+from mrtm.joint.equations import FUSED
 from mrtm.joint.graph import GraphError, JointGraph
 from mrtm.joint.own_graph import own_graph, refusal
-
-FUSED = {EdgeKind.FUSING, EdgeKind.SIGHTING}
-"""What sightings make; alignments refine where these have put robots."""
 
 
 @dataclass(slots=True)
@@ -182,7 +180,10 @@ class JointMap:
     def _merge(
         self, graph: JointGraph, reached: set[str], robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]
     ) -> None:
-        """Take the other robots' own graphs into that of those ``reached``; what sightings made comes first."""
+        """Take the other robots' own graphs into that of those ``reached``.
+
+        What sightings made comes first; alignments refine where it has put the robots.
+        """
         fused = {i: e for i, e in added.items() if e.kind in FUSED}
         while len(reached) < len(robots):
             edges = (*fused.values(), *added.values())

@@ -55,12 +55,7 @@ class Vertex:
         if not len(self.places):
             return UncertainPose(pose_of(pose), covariance)
         here_T_place = se2.between(pose, self.places)
-        c, s = np.cos(here_T_place[:, 2]), np.sin(here_T_place[:, 2])
-        adjoint = np.zeros((len(c), 3, 3))
-        adjoint[:, 0, 0] = adjoint[:, 1, 1] = c
-        adjoint[:, 0, 1], adjoint[:, 1, 0] = -s, s
-        adjoint[:, 0, 2], adjoint[:, 1, 2] = here_T_place[:, 1], -here_T_place[:, 0]
-        adjoint[:, 2, 2] = 1.0
+        adjoint = se2.adjoint(here_T_place)
         weights = 1.0 / (NEAR**2 + (here_T_place[:, :2] ** 2).sum(axis=1)) ** 2
         carried = adjoint @ self.covariances @ np.transpose(adjoint, (0, 2, 1))
         variances, axes = np.linalg.eigh(carried)

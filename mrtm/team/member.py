@@ -17,7 +17,6 @@ from frontend.local_slam import Visit
 from frontend.records import FloatArray, LaserScan
 from mrtm.config import Config
 from mrtm.joint.graph import JointGraph
-from mrtm.joint.sightings.common_frame import adjoint
 from mrtm.result import EdgeFate, Event
 from mrtm.robot.poses import pose_of
 from mrtm.robot.robot import Robot
@@ -247,7 +246,7 @@ def local_map_of(vertex: Vertex, times: FloatArray) -> LocalMap:
 
 def _bends(vertex: Vertex) -> Bends:
     """What the covariances of the poses that a map was drawn at say of its parts: their means over squares."""
-    carry = adjoint(vertex.places)
+    carry = se2.adjoint(vertex.places)
     covariances = carry @ vertex.covariances @ np.swapaxes(carry, -1, -2)
     covariances = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
     covariances /= np.maximum(np.abs(covariances).max(axis=(1, 2), keepdims=True) / LOST, 1.0)

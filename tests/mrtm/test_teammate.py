@@ -51,6 +51,14 @@ def all_at_once() -> Teammate:
     return one
 
 
+def assert_same_maps(one: Teammate, other: Teammate, within: float = 1e-6) -> None:
+    """The same components, and poses in them that lie so near."""
+    assert partition(one) == partition(other)
+    for component in other.joint.components():
+        poses = one.joint.component(component.robots[0]).graph.estimates()
+        assert apart(poses, component.graph.estimates(), component.graph.root) < within
+
+
 def writer(record: Record) -> str:
     return record.key.robot
 
@@ -87,10 +95,7 @@ def test_five_robots_end_with_the_same_joint_map_however_they_met(seed: int, los
         assert one.store.summary() == whole.store.summary(), name
         one.think()
         one.settle()
-        assert partition(one) == partition(whole)
-        for component in whole.joint.components():
-            poses = one.joint.component(component.robots[0]).graph.estimates()
-            assert apart(poses, component.graph.estimates(), component.graph.root) < 1e-6
+        assert_same_maps(one, whole)
         assert {k: j.verdict for k, j in one.judgements.items()} == {k: j.verdict for k, j in whole.judgements.items()}
 
 
@@ -101,10 +106,7 @@ def test_what_is_known_on_the_way_is_the_settled_map_within_the_noise() -> None:
     for part in np.array_split(np.arange(len(told)), 10):
         one.store.merge([told[i] for i in part])
         one.think()
-    assert partition(one) == partition(all_at_once())
-    for component in all_at_once().joint.components():
-        poses = one.joint.component(component.robots[0]).graph.estimates()
-        assert apart(poses, component.graph.estimates(), component.graph.root) < 1e-3
+    assert_same_maps(one, all_at_once(), within=1e-3)
 
 
 def test_the_joint_map_is_that_of_the_truth_and_of_who_met() -> None:
@@ -327,10 +329,7 @@ def test_what_hostile_records_come_to_in_the_end_does_not_depend_on_when_they_co
     for one in (late, early):
         one.think()
         one.settle()
-    assert partition(late) == partition(early)
-    for component in late.joint.components():
-        poses = early.joint.component(component.robots[0]).graph.estimates()
-        assert apart(poses, component.graph.estimates(), component.graph.root) < 1e-6
+    assert_same_maps(early, late)
 
 
 # Sightings without headings.

@@ -58,7 +58,7 @@ def fit(a: Surface, b: Surface, a_T_b: FloatArray) -> Fit:
     square = weights @ np.square(points).sum(axis=1)
     noise = np.array([[weights.sum(), 0.0, -y], [0.0, weights.sum(), x], [-y, x, square]])
     values, vectors = np.linalg.eigh(information - NORMAL_NOISE * noise)
-    carried = _adjoint(b_T_a)
+    carried = se2.adjoint(b_T_a)
     drift = _drift(b.bends, points.mean(axis=0)) + carried @ _drift(a.bends, a.points[in_a].mean(axis=0)) @ carried.T
     drift[:2, :2] += FLOOR**2 * np.eye(2)
     residual = float(np.sqrt(np.mean(np.square(residuals))))
@@ -95,12 +95,3 @@ def _drift(bends: Bends, point: FloatArray) -> FloatArray:
     weights = 1.0 / (NEARBY**2 + np.square(bends.places - point).sum(axis=1)) ** 2
     values, vectors = np.linalg.eigh(np.average(bends.covariances, axis=0, weights=weights))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)  # rounding may have made it indefinite
-
-
-def _adjoint(a_T_b: FloatArray) -> FloatArray:
-    """(3, 3) that takes tangent vectors at b to a."""
-    x, y, theta = a_T_b
-    result = np.eye(3)
-    result[:2, :2] = rotation(theta)
-    result[:2, 2] = y, -x
-    return result

@@ -131,7 +131,7 @@ def factorise(starts, rows, diagonal, below):  # type: ignore[no-untyped-def]
         diagonal[j] = inverse
         for p in range(starts[j], starts[j + 1]):
             upper[p] = below[p]
-            _multiply(upper[p], inverse, below[p])
+            multiply(upper[p], inverse, below[p])
         for q in range(starts[j], starts[j + 1]):
             k = rows[q]
             at = starts[k]
@@ -235,7 +235,8 @@ def _inverse(a, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _multiply(a, b, out):  # type: ignore[no-untyped-def]
+def multiply(a, b, out):  # type: ignore[no-untyped-def]
+    """``out`` = a b."""
     for r in range(3):
         for c in range(3):
             out[r, c] = a[r, 0] * b[0, c] + a[r, 1] * b[1, c] + a[r, 2] * b[2, c]

@@ -17,6 +17,7 @@ from mrtm.joint.sightings.block_cholesky import (
     Blocks,
     factorise,
     inverse_of_factors,
+    multiply,
     pattern_of,
     slot,
     substitute,
@@ -44,7 +45,7 @@ class CommonFrame:
     def predict(self, tail: IntArray, head: IntArray) -> tuple[FloatArray, FloatArray]:
         """tail_T_head (n, 3) and its covariance (n, 3, 3) in the frame of head."""
         relative = se2.between(self.poses[tail], self.poses[head])
-        back = adjoint(se2.inverse(relative))
+        back = se2.adjoint(se2.inverse(relative))
         turned = np.swapaxes(back, -1, -2)
         p, u, v = self.covariance, tail - 1, head - 1
         cross = back @ p.at(u, v)
@@ -123,16 +124,6 @@ def examine(frame: CommonFrame, sightings: Measurements, believed: BoolArray) ->
 _ALONE = 1e-6  # share of a sighting's noise that a residual keeps where nothing else tells of it
 
 
-def adjoint(poses: FloatArray) -> FloatArray:
-    """(..., 3, 3) Ad of (..., 3) poses: takes tangent vectors from the frame after the pose to the one before it."""
-    c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
-    matrix = np.zeros((*poses.shape, 3))
-    matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2] = c, -s, poses[..., 1]
-    matrix[..., 1, 0], matrix[..., 1, 1], matrix[..., 1, 2] = s, c, -poses[..., 0]
-    matrix[..., 2, 2] = 1.0
-    return matrix
-
-
 def _own_edges(maps: Sequence[OwnMap]) -> tuple[IntArray, FloatArray, FloatArray]:
     """The tree edges of all maps: rows of tail and head, measured pose, information in the frame of the head."""
     sizes = [len(own.vertices) for own in maps]
@@ -169,7 +160,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
                 j = e - split
                 innovation(full[j], measured[j], tail_anchor[j], head_anchor[j], predicted, pose, r, h)
                 _turned_product(h, weights[j], mixed)
-                _product(mixed, h, information)
+                multiply(mixed, h, information)
                 _times(mixed, r, g)
             # A step of the head counts as it is, one of the tail as seen from the head.
             tail, head = tails[e] - 1, heads[e] - 1
@@ -179,7 +170,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
                 vector[place[head]] += g
             if tail >= 0:
                 _turned_product(back, information, mixed)
-                _product(mixed, back, h)
+                multiply(mixed, back, h)
                 diagonal[place[tail]] += h
                 for a in range(3):
                     for b in range(3):
@@ -220,13 +211,6 @@ def _back(pose, out):  # type: ignore[no-untyped-def]
     out[0, 0], out[0, 1], out[0, 2] = -c, -s, -y
     out[1, 0], out[1, 1], out[1, 2] = s, -c, x
     out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, -1.0
-
-
-@njit(cache=True)
-def _product(a, b, out):  # type: ignore[no-untyped-def]
-    for r in range(3):
-        for c in range(3):
-            out[r, c] = a[r, 0] * b[0, c] + a[r, 1] * b[1, c] + a[r, 2] * b[2, c]
 
 
 @njit(cache=True)

@@ -14,9 +14,23 @@ GATE_FULL, GATE_POSITION = 16.266, 13.816
 """chi2 at 99.9 % of 3 and of 2 degrees of freedom."""
 
 
+_FALSE_AREA = math.pi * 10.0**2  # m^2
+
+
 def gates(full: BoolArray) -> FloatArray:
     """(n,) the 99.9 % gate of each sighting."""
     return np.where(full, GATE_FULL, GATE_POSITION)
+
+
+def share_passing(spread: FloatArray, full: BoolArray, gate: FloatArray) -> FloatArray:
+    """(n,) share of random false ones that would pass ``gate`` (n,): its volume over that of where they may lie.
+
+    Args:
+        spread: (n,) sqrt(det) of the innovation's covariance.
+        full: (n,) whether it has three dimensions, else two.
+    """
+    ball = np.where(full, 4.0 / 3.0 * math.pi * gate**1.5 / (2.0 * math.pi), math.pi * gate)
+    return np.asarray(ball * spread / _FALSE_AREA)
 
 
 def innovations(sightings: Measurements, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -1,7 +1,6 @@
 """From pairs of robots whose frames are known to each other to components, and which sightings fit them."""
 
 import heapq
-import math
 from collections.abc import Mapping, Sequence
 
 import gtsam
@@ -10,8 +9,8 @@ import numpy as np
 from factors import UncertainPose, adjoint_transport
 from frontend import se2
 from mrtm.joint.sightings.common_frame import CommonFrame, examine, solve
-from mrtm.joint.sightings.hypotheses import BoolArray, FloatArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
-from mrtm.joint.sightings.innovation import gates
+from mrtm.joint.sightings.hypotheses import BoolArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
+from mrtm.joint.sightings.innovation import gates, share_passing
 from mrtm.joint.sightings.pairs import LEAST_SUPPORT, Evidence, Finding, Proposed, find, outnumbers
 
 Pair = tuple[str, str]
@@ -19,7 +18,6 @@ Pair = tuple[str, str]
 CHANCE = 0.01
 """A sighting is believed only where fewer than this share of random false ones, anywhere within 10 m, would fit."""
 
-_FALSE_AREA = math.pi * 10.0**2
 _ROUNDS = 12
 
 
@@ -87,7 +85,7 @@ class Joining:
                 frame, _ = self._frames[robots[0]]
                 examined = examine(frame, self._among(robots, which, wide), np.zeros(len(which), np.bool_))
                 fits[which] = (examined.chi2 < self.gates[which]) & (
-                    _chance(examined.spread, self._sightings.full[which]) < CHANCE
+                    share_passing(examined.spread, self._sightings.full[which], self.gates[which]) < CHANCE
                 )
         return fits
 
@@ -224,7 +222,7 @@ class Joining:
                 continue
             self._poses[vertices] = frame.poses
             self.chi2[which] = examined.chi2
-            self._decidable[which] = _chance(examined.spread, sightings.full) < CHANCE
+            self._decidable[which] = share_passing(examined.spread, sightings.full, self.gates[which]) < CHANCE
             first, row = {}, 0
             for robot in robots:
                 first[robot], row = row, row + len(self._at[robot])
@@ -244,10 +242,3 @@ def _unite(groups: dict[str, set[str]], a: str, b: str) -> None:
         groups[a] |= groups[b]
         for robot in groups[b]:
             groups[robot] = groups[a]
-
-
-def _chance(spread: FloatArray, full: BoolArray) -> FloatArray:
-    """(n,) share of random false sightings that would pass the gate: its volume over that of where they may lie."""
-    gate = gates(full)
-    ball = np.where(full, 4.0 / 3.0 * math.pi * gate**1.5 / (2.0 * math.pi), math.pi * gate)
-    return np.asarray(ball * spread / _FALSE_AREA)

@@ -26,7 +26,6 @@ from mrtm.joint.alignment.agreement import (
     overlap,
     scores,
 )
-from mrtm.joint.sightings.common_frame import adjoint
 from mrtm.joint.sightings.hypotheses import RobotGraph, coordinates
 
 LEAST_OVERLAP = 20.0
@@ -175,9 +174,9 @@ def _seen_from(graph: RobotGraph, vertex: VertexId, others: tuple[VertexId, ...]
 def _between(ours: _Around, tail_T_head: UncertainPose, theirs: _Around) -> tuple[FloatArray, FloatArray]:
     """The poses (n, k, 3) of their vertices seen from ours, and their standard deviations (n, k, 3)."""
     u_T_head = se2.between(ours.poses, np.array(coordinates(tail_T_head.pose)))
-    back = adjoint(se2.inverse(u_T_head))
+    back = se2.adjoint(se2.inverse(u_T_head))
     at_head = back @ ours.covariances @ np.swapaxes(back, -1, -2) + tail_T_head.covariance
-    back = adjoint(se2.inverse(theirs.poses))
+    back = se2.adjoint(se2.inverse(theirs.poses))
     at_v = back @ at_head[:, None] @ np.swapaxes(back, -1, -2) + theirs.covariances
     seen = se2.compose(u_T_head[:, None], theirs.poses[None])
     return seen, np.sqrt(np.diagonal(at_v, axis1=-2, axis2=-1))
