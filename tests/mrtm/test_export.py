@@ -13,7 +13,7 @@ import yaml
 from PIL import Image
 from rich.console import Console
 
-from factors import Edge, VertexId
+from factors import Edge, VertexId, factor_of, without_kernel
 from mrtm.output.export import export
 from mrtm.output.files import replacing, to_json
 from mrtm.output.local_maps import read_local_map
@@ -85,12 +85,7 @@ def test_gtsam_reads_the_graph_and_keeps_its_errors(out: Path) -> None:
         assert values.atPose2(key).equals(result.vertex_poses[vertex], 1e-7)
     for i, edge in enumerate(accepted):
         assert edge.estimate is not None
-        factor = gtsam.BetweenFactorPose2(
-            order.index(edge.tail),
-            order.index(edge.head),
-            edge.estimate.pose,
-            gtsam.noiseModel.Gaussian.Covariance(edge.covariance),
-        )
+        factor = without_kernel(factor_of(edge, order.index(edge.tail), order.index(edge.head)))
         assert graph.at(i).error(values) == pytest.approx(factor.error(values), rel=1e-4)
 
 
