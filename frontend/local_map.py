@@ -5,8 +5,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from frontend import se2
 from frontend.grid import NX, NY, UNIT, Maps, N, X, Y
 from frontend.records import FloatArray
+
+NEAR = 3.0  # metres: poses of a map nearer than this all tell about the same of its error
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +42,37 @@ class Bends:
 
     places: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     covariances: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
+
+    def extended(self, poses: FloatArray, covariances: FloatArray) -> "Bends":
+        """These and those of (n, 3) ``poses`` the map was drawn at; (n, 3, 3) ``covariances`` in their own frames."""
+        carry = se2.adjoint(poses)
+        carried = carry @ covariances @ np.swapaxes(carry, -1, -2)
+        carried = 0.5 * (carried + np.swapaxes(carried, -1, -2))
+        return Bends(np.concatenate([self.places, poses[:, :2]]), np.concatenate([self.covariances, carried]))
+
+    def shares(self, points: FloatArray) -> FloatArray:
+        """(n, k) how much of what lies at (n, 2) ``points`` was drawn from each place: from the nearer ones more.
+
+        There must be a place. The shares of a point sum to 1.
+        """
+        square = np.square(points[:, None] - self.places).sum(axis=-1)
+        weights = 1.0 / np.square(NEAR**2 + square)
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+    def errors(self, shares: FloatArray) -> FloatArray:
+        """(n, 3, 3), as ``covariances``, of what was drawn from the places in (n, k) ``shares``.
+
+        Errors gather on the way from the origin, and those of two places go together as far as their ways do: as in
+        Brownian motion of several parameters (P. Levy, "Processus stochastiques et mouvement brownien", 1948).
+        """
+        variances, axes = np.linalg.eigh(self.covariances)
+        roots = (axes * np.sqrt(np.maximum(variances, 0.0))[:, None, :]) @ np.swapaxes(axes, -1, -2)
+        way = np.maximum(np.linalg.norm(self.places, axis=1), 1e-6)
+        apart = np.linalg.norm(self.places[:, None] - self.places, axis=-1)
+        together = 0.5 * (way[:, None] + way - apart) / np.sqrt(way[:, None] * way)
+        parts = shares[:, :, None] * roots.reshape(-1, 9)
+        shape = (len(shares), -1, 3)
+        return np.asarray(parts.reshape(shape).swapaxes(-1, -2) @ (together @ parts).reshape(shape))
 
 
 @dataclass(frozen=True, slots=True)

@@ -121,15 +121,12 @@ class Robot:
         with self._stages("closing"):
             visit = self._slam.finish()
         here = self._here
-        chosen = [
-            here.uncertain(pose, covariance)
-            for pose, covariance in zip(visit.poses[visit.chosen], visit.covariances, strict=True)
-        ]
+        chosen = visit.poses[visit.chosen]
+        known = here.covariances(chosen, visit.covariances)
         here.maps, here.spread = visit.maps, visit.spread
         here.scans.extend(range(self._first, self._first + len(visit.poses)))
         here.poses.extend(visit.poses)
-        known = np.array([pose.covariance for pose in chosen])
-        here.drawn_from(visit.poses[visit.chosen], known)
+        here.drawn_from(chosen, known)
         self._tell(
             "left vertex",
             vertex=str(here.id),
@@ -137,9 +134,9 @@ class Robot:
             since_resampling=visit.since_resampling,
             sigma=round(visit.sigma, 5),
         )
-        self._update_edge(chosen[0])
+        self._update_edge(UncertainPose(pose_of(chosen[0]), known[0]))
         self._visited(here, self._first, replace(visit, covariances=known))
-        return chosen[-1]
+        return UncertainPose(pose_of(chosen[-1]), known[-1])
 
     def _update_edge(self, entered: UncertainPose) -> None:
         """M5: the vertex was entered by a known edge and is well known now; fuse the edge with what was measured."""

@@ -9,11 +9,10 @@ import numpy as np
 from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId, compose, inverse
 from frontend import se2
 from frontend.grid import Maps
+from frontend.local_map import NEAR, Bends
 from frontend.records import FloatArray
 from mrtm.result import EdgeFate
 from mrtm.robot.poses import pose_of
-
-NEAR = 3.0  # metres: poses of a map nearer than this all tell about the same of its error
 
 
 @dataclass(slots=True)
@@ -24,8 +23,7 @@ class Vertex:
         id: name.
         maps: what is known of the place (a stack of one), as the last visit left it; None during the first visit.
         spread: (3, 3) covariance of the particles when the robot last left.
-        places: poses (k, 3) from which the map was made, and
-        covariances: (k, 3, 3) how well each is known in the frame of the vertex, each in its own tangent frame.
+        bends: how sure the parts of the map are, from the poses it was made from.
         scans: indices of the robot's scans taken here, in the order they came.
         poses: local_T_robot (3,) at each of them.
     """
@@ -33,35 +31,30 @@ class Vertex:
     id: VertexId
     maps: Maps | None = None
     spread: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
-    places: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
-    covariances: FloatArray = field(default_factory=lambda: np.empty((0, 3, 3)))
+    bends: Bends = field(default_factory=Bends)
     scans: list[int] = field(default_factory=list)
     poses: list[FloatArray] = field(default_factory=list)
 
     def drawn_from(self, poses: FloatArray, covariances: FloatArray) -> None:
         """Take note of poses (k, 3) with covariances (k, 3, 3) that the map was made from, where there was none yet."""
-        off = poses[:, None, :2] - self.places[None, :, :2]
+        off = poses[:, None, :2] - self.bends.places
         new = (np.hypot(off[..., 0], off[..., 1]) > NEAR).all(axis=1)
-        self.places = np.concatenate([self.places, poses[new]])
-        self.covariances = np.concatenate([self.covariances, covariances[new]])
+        self.bends = self.bends.extended(poses[new], covariances[new])
+
+    def covariances(self, poses: FloatArray, covariances: FloatArray) -> FloatArray:
+        """(n, 3, 3) of (n, 3) ``poses`` known to ``covariances`` in the map, with the map's own error there added.
+
+        All in the poses' own tangent frames.
+        """
+        if not len(self.bends.places):
+            return covariances
+        back = se2.adjoint(se2.inverse(poses))
+        errors = self.bends.errors(self.bends.shares(poses[:, :2]))
+        return np.asarray(covariances + back @ errors @ np.swapaxes(back, -1, -2))
 
     def uncertain(self, pose: FloatArray, covariance: FloatArray) -> UncertainPose:
-        """A pose (3,) known to ``covariance`` (3, 3) in the map, with the map's own error as seen from it added.
-
-        What is seen was drawn from all the poses the map was made from: their errors, carried here, are averaged, the
-        nearer ones counting more, and taken to go together. Averaging the covariances would say more than the largest
-        that this average can have.
-        """
-        if not len(self.places):
-            return UncertainPose(pose_of(pose), covariance)
-        here_T_place = se2.between(pose, self.places)
-        adjoint = se2.adjoint(here_T_place)
-        weights = 1.0 / (NEAR**2 + (here_T_place[:, :2] ** 2).sum(axis=1)) ** 2
-        carried = adjoint @ self.covariances @ np.transpose(adjoint, (0, 2, 1))
-        variances, axes = np.linalg.eigh(carried)
-        roots = (axes * np.sqrt(np.maximum(variances, 0.0))[:, None, :]) @ np.transpose(axes, (0, 2, 1))
-        root = np.average(roots, axis=0, weights=weights)
-        return UncertainPose(pose_of(pose), covariance + root @ root)
+        """One pose (3,), as ``covariances``."""
+        return UncertainPose(pose_of(pose), self.covariances(pose[None], covariance[None])[0])
 
 
 class Topology:

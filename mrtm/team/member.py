@@ -245,12 +245,10 @@ def local_map_of(vertex: Vertex, times: FloatArray) -> LocalMap:
 
 
 def _bends(vertex: Vertex) -> Bends:
-    """What the covariances of the poses that a map was drawn at say of its parts: their means over squares."""
-    carry = se2.adjoint(vertex.places)
-    covariances = carry @ vertex.covariances @ np.swapaxes(carry, -1, -2)
-    covariances = 0.5 * (covariances + np.swapaxes(covariances, -1, -2))
-    covariances /= np.maximum(np.abs(covariances).max(axis=(1, 2), keepdims=True) / LOST, 1.0)
-    places, side, count = vertex.places[:, :2], SQUARE, MOST_PLACES + 1
+    """What a vertex tells of how sure the parts of its map are: the means over squares."""
+    covariances, places = vertex.bends.covariances, vertex.bends.places
+    covariances = covariances / np.maximum(np.abs(covariances).max(axis=(1, 2), keepdims=True) / LOST, 1.0)
+    side, count = SQUARE, MOST_PLACES + 1
     while count > MOST_PLACES:
         squares, which = np.unique(np.floor(places / side), axis=0, return_inverse=True)
         count, side = len(squares), 2.0 * side

@@ -37,8 +37,11 @@ class BetweenChecks:
         pose, covariance = random_pose(self.rng), random_covariance(self.rng, sigma)
         return Edge(EdgeId("red", 4), 0, kind, VertexId("red", 0), VertexId("red", 1), pose, covariance)
 
-    def error_and_derivatives(self, kind: EdgeKind, build: Builder) -> None:
-        """``e = Log(Z^-1 A^-1 B)``: value, closed-form Jacobians and central differences, at poses near and far."""
+    def error_and_derivatives(self, kind: EdgeKind, build: Builder, shared: float = 1.0) -> None:
+        """``e = Log(Z^-1 A^-1 B)``: value, closed-form Jacobians and central differences, at poses near and far.
+
+        The factor has ``shared`` times the edge's covariance.
+        """
         for spread in (0.0, 0.01, 1.0):
             edge = self.edge(kind, 0.1)
             a = random_pose(self.rng)
@@ -59,7 +62,7 @@ class BetweenChecks:
 
             # What the solver sees: whitened by the square root information (times the kernel's weight).
             jacobian, _ = factor.linearize(values).jacobian()
-            information: FloatArray = np.linalg.inv(edge.covariance).astype(np.float64)
+            information: FloatArray = np.linalg.inv(shared * edge.covariance).astype(np.float64)
             weight = self._weight(factor, float(residual @ information @ residual))
             seen: FloatArray = jacobian.T @ jacobian
             expected: FloatArray = weight * self._stack(by_tail, by_head, information)

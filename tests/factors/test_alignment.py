@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from factors import Edge, EdgeId, EdgeKind, VertexId, alignment_factor, factor_of, has_kernel
+from factors.alignment import SHARED
 
 
 def test_error_and_derivatives(checks: Any) -> None:
-    checks.error_and_derivatives(EdgeKind.ALIGNMENT, alignment_factor)
+    checks.error_and_derivatives(EdgeKind.ALIGNMENT, alignment_factor, SHARED)
 
 
 def test_covariance_frame(checks: Any) -> None:
@@ -31,3 +32,17 @@ def test_a_corridor_weighs_across_it_and_hardly_along_it() -> None:
 
     assert cost(0.5, 0.0, 0.0) == pytest.approx(0.5 * 0.01, rel=1e-6)
     assert cost(0.0, 0.02, 0.0) == pytest.approx(0.5 * 4.0, rel=1e-6)
+
+
+def test_maps_of_one_robot_share_errors_with_its_other_edges() -> None:
+    values = gtsam.Values()
+    values.insert(0, gtsam.Pose2())
+    values.insert(1, gtsam.Pose2(0.1, 0.0, 0.0))
+    own, between = (
+        factor_of(
+            Edge(EdgeId("red", 0), 0, EdgeKind.ALIGNMENT, VertexId("red", 0), head, gtsam.Pose2(), np.eye(3)), 0, 1
+        )
+        for head in (VertexId("red", 1), VertexId("blue", 0))
+    )
+    assert between.error(values) == pytest.approx(0.5 * 0.1**2)
+    assert own.error(values) == pytest.approx(between.error(values) / SHARED)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from factors import Edge, EdgeKind, UncertainPose, VertexId
+from frontend.local_map import Bends
 from frontend.records import FloatArray
 from mrtm.joint.graph import JointGraph
 from mrtm.robot.topology import Topology, Vertex
@@ -179,8 +180,7 @@ def test_the_error_of_a_map_is_that_of_the_poses_it_was_made_from() -> None:
     own = np.diag([1e-4, 4e-4, 1e-5])
     pose = np.array([5.0, 0.0, np.pi / 2])
     np.testing.assert_array_equal(vertex.uncertain(pose, own).covariance, own)
-    vertex.places = np.array([[0.0, 0.0, 0.0]])
-    vertex.covariances = np.diag([1e-4, 2e-4, 1e-4])[None]
+    vertex.drawn_from(np.zeros((1, 3)), np.diag([1e-4, 2e-4, 1e-4])[None])
     found = vertex.uncertain(pose, own)
     assert found.pose.equals(gtsam.Pose2(5.0, 0.0, np.pi / 2), 1e-12)
     # Five metres on, turned left: what was to the side is ahead, and moves by 5 m times the error of the heading.
@@ -190,16 +190,19 @@ def test_the_error_of_a_map_is_that_of_the_poses_it_was_made_from() -> None:
     assert added[2, 2] == pytest.approx(1e-4)
     assert np.linalg.eigvalsh(added).min() > -1e-12
     # Of two poses the nearer one counts more.
-    vertex.places = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
-    vertex.covariances = np.stack([np.diag([1e-4, 2e-4, 1e-4]), 1e-6 * np.eye(3)])
+    vertex.bends = Bends().extended(
+        np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]]), np.stack([np.diag([1e-4, 2e-4, 1e-4]), 1e-6 * np.eye(3)])
+    )
     assert vertex.uncertain(pose, own).covariance[0, 0] - own[0, 0] < 0.3 * added[0, 0]
     # A later visit draws into the map that is there, and does not make it worse.
-    before = vertex.places.copy()
-    vertex.drawn_from(np.array([[5.5, 0.5, 1.0], [12.0, 0.0, 0.0]]), np.stack([np.eye(3), 2.0 * np.eye(3)]))
-    np.testing.assert_array_equal(vertex.places, [*before, [12.0, 0.0, 0.0]])
-    np.testing.assert_array_equal(vertex.covariances[-1], 2.0 * np.eye(3))
+    before = vertex.bends.places
+    vertex.drawn_from(np.array([[5.5, 0.5, 1.0], [0.0, 12.0, 0.0]]), np.stack([np.eye(3), 1e-2 * np.eye(3)]))
+    np.testing.assert_array_equal(vertex.bends.places, [*before, [0.0, 12.0]])
+    there = vertex.uncertain(np.array([0.0, 12.0, 0.0]), own).covariance - own
+    np.testing.assert_allclose(there, 1e-2 * np.eye(3), rtol=0.1, atol=2e-3)
     # Errors are averaged, not their squares: beside a pose without error, half an error is a quarter of its square.
-    vertex.places = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
-    vertex.covariances = np.stack([np.zeros((3, 3)), np.diag([4e-4, 1e-4, 0.0])])
+    vertex.bends = Bends().extended(
+        np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]]), np.stack([np.zeros((3, 3)), np.diag([4e-4, 1e-4, 0.0])])
+    )
     half = vertex.uncertain(np.array([5.0, 0.0, 0.0]), own).covariance - own
     np.testing.assert_allclose(half, np.diag([1e-4, 0.25e-4, 0.0]), atol=1e-12)

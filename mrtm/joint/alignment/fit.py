@@ -20,8 +20,8 @@ REACH = 0.15  # metres between the points of a pair
 PATCH = 1.5  # metres of a wall that share an error
 POINT, COMMON = 0.005, 0.003  # metres: least standard deviation of a point's own error, and of a patch's
 NORMAL_NOISE = 0.01  # variance of a normal's direction, rad^2: makes a bare wall seem to say something along itself
-FLOOR = 0.003  # metres: of every alignment, for slips within a map; from simulated pairs in six kinds of buildings
-NEARBY = 3.0  # metres: places of a map within this tell the same of its error
+FLOOR = 0.002  # metres: of every alignment, for slips within a map; from simulated pairs in six kinds of buildings
+SAMPLE = 200  # points at which a map's error is looked up
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ def fit(a: Surface, b: Surface, a_T_b: FloatArray) -> Fit:
     noise = np.array([[weights.sum(), 0.0, -y], [0.0, weights.sum(), x], [-y, x, square]])
     values, vectors = np.linalg.eigh(information - NORMAL_NOISE * noise)
     carried = se2.adjoint(b_T_a)
-    drift = _drift(b.bends, points.mean(axis=0)) + carried @ _drift(a.bends, a.points[in_a].mean(axis=0)) @ carried.T
+    drift = _drift(b.bends, points) + carried @ _drift(a.bends, a.points[in_a]) @ carried.T
     drift[:2, :2] += FLOOR**2 * np.eye(2)
     residual = float(np.sqrt(np.mean(np.square(residuals))))
     return Fit(len(points), residual, (vectors * np.maximum(values, 0.0)) @ vectors.T, drift)
@@ -84,14 +84,9 @@ def _weights(residuals: FloatArray, patch: npt.NDArray[np.int64]) -> FloatArray:
     return np.asarray(1.0 / (max(POINT**2, own) + count * max(COMMON**2, common)))[patch]
 
 
-def _drift(bends: Bends, point: FloatArray) -> FloatArray:
-    """(3, 3) covariance, in the map's frame, of what lies at ``point`` against the map's origin: of the places near.
-
-    All of it, though what was drawn at several places errs less: the edges between the maps and their other alignments
-    have the same error, which the graph takes for independent.
-    """
+def _drift(bends: Bends, points: FloatArray) -> FloatArray:
+    """(3, 3) covariance, in the map's frame, of what lies at (n, 2) ``points``, as a whole, against its origin."""
     if not len(bends.places):
         return np.zeros((3, 3))
-    weights = 1.0 / (NEARBY**2 + np.square(bends.places - point).sum(axis=1)) ** 2
-    values, vectors = np.linalg.eigh(np.average(bends.covariances, axis=0, weights=weights))
-    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)  # rounding may have made it indefinite
+    shares = bends.shares(points[:: -(-len(points) // SAMPLE)]).mean(axis=0, keepdims=True)
+    return np.asarray(bends.errors(shares)[0])
