@@ -21,6 +21,8 @@ from factors.noise import (
     compose,
     has_kernel,
     inverse,
+    weighed,
+    weight,
     without_kernel,
 )
 from factors.prior import ROOT_COVARIANCE, prior_factor
@@ -79,5 +81,7 @@ __all__ = [
     "loop_factor",
     "prior_factor",
     "sighting_factor",
+    "weighed",
+    "weight",
     "without_kernel",
 ]

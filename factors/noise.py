@@ -123,3 +123,20 @@ def without_kernel(factor: gtsam.NoiseModelFactor) -> gtsam.NoiseModelFactor:
     if not isinstance(noise, gtsam.noiseModel.Robust):
         return factor
     return factor.cloneWithNewNoiseModel(noise.noise())
+
+
+def weight(factor: gtsam.NoiseModelFactor, values: gtsam.Values) -> float:
+    """What the robust kernel of a factor that has one leaves of its information, where ``values`` have its ends."""
+    full = FULL_WEIGHT[factor.dim()]
+    chi2 = 2.0 * without_kernel(factor).error(values)
+    return float(min(1.0, 2.0 * full / (full + chi2)) ** 2)
+
+
+def weighed(factor: gtsam.NoiseModelFactor, share: float) -> gtsam.NoiseModelFactor:
+    """The same factor with a fixed share of its information in place of its robust kernel."""
+    plain = without_kernel(factor)
+    if share == 1.0:
+        return plain
+    noise = plain.noiseModel()
+    assert isinstance(noise, gtsam.noiseModel.Gaussian)
+    return factor.cloneWithNewNoiseModel(gtsam.noiseModel.Gaussian.Information(share * noise.information()))

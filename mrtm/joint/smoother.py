@@ -6,6 +6,7 @@ where informations in a clique differ by more than about 1e7, as corridors can m
 is such a one). From then on QR, which solves those too and takes up to twice as long.
 """
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from typing import NamedTuple, TypeVar
 
@@ -13,37 +14,41 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from factors import EdgeId, has_kernel
-from mrtm.joint.relinearization import portion
+from factors import EdgeId
+from mrtm.joint.kernels import Kernels
+from mrtm.joint.relinearization import TURN, portion
 
 FloatArray = npt.NDArray[np.float64]
 T = TypeVar("T")
 
 
 class _Tolerance(NamedTuple):
-    """When a variable counts as settled, metres or radians.
+    """When a variable counts as settled.
 
     Attributes:
-        relinearize: it has moved less than this since it was linearised.
-        wildfire: it has moved less than this since those that depend on it were told.
+        shift, turn: metres and radians; it has moved less than this since it was linearised.
+        wildfire: metres or radians; it has moved less than this since those that depend on it were told.
     """
 
-    relinearize: float
+    shift: float
+    turn: float
     wildfire: float
 
 
 # The estimate is within about 2e-5 of the optimum.
-_EXACT = _Tolerance(1e-4, 1e-5)
+_EXACT = _Tolerance(1e-4, 1e-4, 1e-5)
 
-# Of a large graph as ``relinearization`` has it; this is for what is done at once, before a kernel weighs a loop.
-_COARSE = _Tolerance(3e-3, 1e-3)
+# Of a large graph: its factors are linear in positions, and their kernels do not depend on where they were linearised.
+_COARSE = _Tolerance(math.inf, TURN, 3e-4)
 _LARGE = 1000  # variables
-_PORTION = 100  # variables that one update of a large graph linearises anew, unless it has more new factors itself
-_PATIENCE = 5  # updates before the next portion, of those that only add vertices; of others twice as many
+_PORTION = 50  # variables that one update of a large graph linearises anew, unless it has more new factors itself
+_PATIENCE = 3  # updates before the next portion, of those that only add vertices; of others twice as many
+
+# Radians: where nothing has turned so far, lengths are right to 5e-5 of themselves, and one step leads to the optimum.
+_FAR = 0.01
 
 _MAX_STEPS = 30
 _NEVER = 2**31 - 1  # updates
-_NONE = -1  # instead of a key
 
 # Factors in all the eliminations that are kept for further questions, seen from one pose each: about 10 kB a factor.
 _KEPT = 1_000
@@ -96,8 +101,7 @@ class Smoother:
         after a large loop: to linearise anew what that has turned is the work of the next updates (``refine``).
         """
         still = len(add) == values.size() and not remove  # each new key is where its only factor has it
-        patience = 0 if self._behind else _PATIENCE
-        due = self._waited >= (patience if still else 2 * _PATIENCE)
+        due = self._behind or self._waited >= (_PATIENCE if still else 2 * _PATIENCE)
         self._waited = 0 if due else self._waited + 1
         self._solve(lambda: self._insert(add, values, remove, _PORTION if due else 0))
         if self._tolerance is not _tolerance(self._size):
@@ -106,14 +110,16 @@ class Smoother:
             self.settle()
 
     def settle(self) -> None:
-        """Linearise anew until nothing is left to be; of a large graph once all that has moved by 3 mm or 3 mrad."""
-        exact = self._tolerance is _EXACT
-        for _ in range(_MAX_STEPS if exact else 1):
+        """Linearise anew until nothing is left to be; of a large graph once, and if it is needed to go on from here."""
+        if self._tolerance is _COARSE:
+            if self._turn().max() > _FAR:
+                self._solve(lambda: self._insert({}, gtsam.Values(), (), None))
+            return
+        for _ in range(_MAX_STEPS):
             if self._settled or self._solve(lambda: self._insert({}, gtsam.Values(), (), None)) == 0:
-                self._settled = exact
+                self._settled = True
                 return
-        if exact:
-            self.refine()
+        self.refine()
 
     def refine(self) -> None:
         """Levenberg-Marquardt over everything from the present estimate, then iSAM2 anew from there."""
@@ -200,7 +206,7 @@ class Smoother:
         rest.erase(root)
         self._size = 1
         self._slots: dict[EdgeId, int] = {}
-        self._kernels = np.full((64, 2), _NONE)  # the ends of the factors that have one, by slot
+        self._kernels = Kernels()
         self._insert(dict(factors), rest, (), 0)
 
     def _solve(self, step: Callable[[], T]) -> T:
@@ -230,56 +236,66 @@ class Smoother:
         most: int | None,
     ) -> int:
         """One update of iSAM2; 0 if no variable had to be linearised anew, as at ``most`` of a large graph may be."""
+        coarse = self._tolerance is _COARSE
+        again: dict[EdgeId, gtsam.NoiseModelFactor] = {}
+        solved = dict(add)
+        if coarse:
+            if not self._behind and not remove:  # weights are those of an estimate at rest
+                again = self._kernels.changed(self._factors, self._isam.calculateEstimate)
+            solved = self._kernels.weighed(add, remove, lambda keys: self._estimate_of(keys, values))
+        solved = again | solved
         graph = gtsam.NonlinearFactorGraph()
-        for factor in add.values():
+        for factor in solved.values():
             graph.push_back(factor)
-        weighed = [factor.keys() for factor in add.values() if has_kernel(factor)]
         change = gtsam.ISAM2UpdateParams()
-        change.removeFactorIndices = [self._slots[edge_id] for edge_id in remove]
-        self._choose(change, weighed, most)
-        if self._tolerance is _COARSE and len(add) == 1:  # at the top of the tree the newest end, and not the old one
+        change.removeFactorIndices = [self._slots[edge_id] for edge_id in (*remove, *again)]
+        if coarse and most is not None:
+            if most:
+                self._choose(change, most)
+        else:
+            change.force_relinearize = True
+        if coarse and len(add) == 1:  # at the top of the tree the newest end, and not the old one
             top = gtsam.KeyGroupMap()
             top.insert2(max(next(iter(add.values())).keys()), 1)
             change.constrainedKeys = top
         self._settled = False
         result = self._isam.update(graph, values, change)
-        new = dict(zip(add, result.getNewFactorsIndices(), strict=True))
-        if (most := max(new.values(), default=0)) >= len(self._kernels):  # doubled: a slot more costs nothing
-            self._kernels = np.concatenate([self._kernels, np.full((most + 1, 2), _NONE)])
         for edge_id in remove:
-            self._kernels[self._slots.pop(edge_id)] = _NONE
+            del self._slots[edge_id]
             del self._factors[edge_id]
-        for edge_id, slot in new.items():
-            self._kernels[slot] = add[edge_id].keys() if has_kernel(add[edge_id]) else _NONE
+        self._kernels.forget(set(remove) - add.keys())
         self._factors.update(add)
-        self._slots.update(new)
+        self._slots.update(zip(solved, result.getNewFactorsIndices(), strict=True))
         self._size += values.size() - result.getUnusedKeys().size()
         self._values = None
         self._seen_from = {}
         return int(result.getVariablesRelinearized())
 
-    def _choose(self, change: gtsam.ISAM2UpdateParams, weighed: list[list[int]], most: int | None) -> None:
-        """Say which variables ``change`` linearises anew: all that have moved; of a large graph ``most`` of them.
+    def _estimate_of(self, keys: list[int], new: gtsam.Values) -> gtsam.Values:
+        """The estimate of some keys, or what is given of them if they are new."""
+        estimate = self._isam.calculateEstimate([key for key in keys if not new.exists(key)])
+        for key in keys:
+            if new.exists(key):
+                estimate.insert(key, new.atPose2(key))
+        return estimate
 
-        And there always the ends of the kernels that come with it, whose weight is to be that of the estimate.
-        """
-        change.force_relinearize = self._tolerance is _EXACT or most is None
-        if change.force_relinearize or not (most or weighed):
-            return
-        point = self._isam.getLinearizationPoint()
-        names = point.keys()
-        keys, moved = np.array(names), self._isam.getDelta().vector(names).reshape(-1, 3)
-        chosen = np.isin(keys, weighed)
-        if most:
-            kernels = np.searchsorted(keys, self._kernels[self._kernels[:, 0] != _NONE])
-            rows = portion(lambda: gtsam.utilities.extractPose2(point), moved, kernels, most)
-            chosen[rows] = True
-            self._behind = len(rows) == most
-        if chosen.any():
-            change.force_relinearize = True
-            left = gtsam.KeyList()
-            for key in keys[~chosen & (np.abs(moved).max(axis=1) >= self._tolerance.relinearize)].tolist():
-                left.push_back(key)
+    def _turn(self) -> FloatArray:
+        """(n,) radians that each variable has turned since it was linearised, in the order of keys."""
+        keys = self._isam.getLinearizationPoint().keys()
+        return np.abs(self._isam.getDelta().vector(keys)[2::3])
+
+    def _choose(self, change: gtsam.ISAM2UpdateParams, most: int) -> None:
+        """Say which variables of a large graph ``change`` linearises anew, ``most`` of them."""
+        point, turn = self._isam.getLinearizationPoint(), self._turn()
+        rows = portion(lambda: gtsam.utilities.extractPose2(point), turn, most)
+        change.force_relinearize = len(rows) > 0
+        self._behind = len(rows) == most
+        if self._behind:
+            waiting = turn >= TURN
+            waiting[rows] = False
+            keys, left = point.keys(), gtsam.KeyList()
+            for row in np.flatnonzero(waiting).tolist():
+                left.push_back(keys[row])
             change.noRelinKeys = left
 
 
@@ -292,7 +308,9 @@ def _parameters(tolerance: _Tolerance, factorization: str) -> gtsam.ISAM2Params:
     gauss_newton.setWildfireThreshold(tolerance.wildfire)
     params = gtsam.ISAM2Params()
     params.setOptimizationParams(gauss_newton)
-    params.setRelinearizeThreshold(tolerance.relinearize)
+    thresholds = gtsam.ISAM2ThresholdMap()
+    thresholds.insert(("\0", np.array([tolerance.shift, tolerance.shift, tolerance.turn])))  # of plain numbers as keys
+    params.setRelinearizeThreshold(thresholds)
     params.setFactorization(factorization)
     params.relinearizeSkip = _NEVER  # but where an update asks for it
     params.findUnusedFactorSlots = True

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from factors import (
+    FULL_WEIGHT,
     AnchoredSighting,
     Edge,
     EdgeId,
@@ -347,6 +348,26 @@ def test_a_large_graph_is_linearised_anew_in_portions(monkeypatch: pytest.Monkey
     assert portions[-1] == 0
     assert off[-1] < 0.02
     assert off[-1] < 0.5 * off[0]
+
+
+def test_kernels_that_bite_have_the_weight_of_the_estimate_in_a_large_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Laps with a loop at every vertex, of which every third is off by five standard deviations."""
+    monkeypatch.setattr(smoother, "_LARGE", 100)
+    world, edges = laps(240, 40)
+    edges = [edge for edge in edges if edge.kind is not EdgeKind.LOOP]
+    for i in range(40, 240):
+        off = (0.0, 0.1, 0.0) if i % 3 == 0 else (0.0, 0.0, 0.0)
+        edges.insert(2 * i - 40, world.edge(1000 + i, i, i - 40, EdgeKind.LOOP, off=off))
+    graph = JointGraph(vertex(0))
+    for edge in edges:
+        graph.update(add=[edge])
+    believed = [edge.id for edge in edges if edge.kind is EdgeKind.LOOP and edge.id not in graph.doubted()]
+    assert sum(graph.chi2(edge_id) > FULL_WEIGHT[3] for edge_id in believed) > 2
+    on_the_way = graph.estimates()
+    graph.optimize_fully()
+    assert distance(on_the_way, graph.estimates()) < 0.02
+    restored = JointGraph.restore(json.loads(json.dumps(graph.checkpoint())))
+    assert distance(restored.estimates(), graph.estimates()) < 1e-4
 
 
 @pytest.mark.parametrize("most", [20, 1000])  # variables that are solved to the last digit
