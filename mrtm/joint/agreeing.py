@@ -40,7 +40,8 @@ def agreeing(
             both = [(_off(equations, mine, step), i, step) for step in (theirs, _back(theirs))]
             found.append(min(both, key=lambda one: one[0]))
     near = sorted((one for one in found if one[0] < _FAR), key=lambda one: one[:2])[:PARTNERS]
-    return [i for _, i, step in near if explains(*_closure(equations, mine, step))]
+    closures = _closures(equations, mine, [step for *_, step in near])
+    return [i for (_, i, _), closure in zip(near, closures, strict=True) if explains(*closure)]
 
 
 def clique(start: EdgeId, agreeing: Mapping[EdgeId, set[EdgeId]], among: Container[EdgeId]) -> list[EdgeId]:
@@ -69,11 +70,14 @@ def _off(equations: Equations, one: _Step, other: _Step) -> float:
     return float(np.hypot(x, y) + _TURN * abs(theta))
 
 
-def _closure(equations: Equations, one: _Step, other: _Step) -> tuple[float, FloatArray]:
-    """chi2 of the way round, and the covariance it has."""
-    through = compose(equations.relative(one[0], other[0]), other[2])
-    direct = compose(one[2], equations.relative(one[1], other[1]))
-    offset = direct.pose.between(through.pose)
-    covariance = through.covariance + adjoint_transport(offset.inverse(), direct.covariance)
-    residual = gtsam.Pose2.Logmap(offset)
-    return float(residual @ np.linalg.solve(covariance, residual)), covariance
+def _closures(equations: Equations, one: _Step, others: Sequence[_Step]) -> list[tuple[float, FloatArray]]:
+    """chi2 of the way round by each of the others, and the covariance it has."""
+    near = equations.relatives([pair for other in others for pair in ((one[0], other[0]), (one[1], other[1]))])
+    found = []
+    for other, there, beyond in zip(others, near[::2], near[1::2], strict=True):
+        through, direct = compose(there, other[2]), compose(one[2], beyond)
+        offset = direct.pose.between(through.pose)
+        covariance = through.covariance + adjoint_transport(offset.inverse(), direct.covariance)
+        residual = gtsam.Pose2.Logmap(offset)
+        found.append((float(residual @ np.linalg.solve(covariance, residual)), covariance))
+    return found

@@ -66,13 +66,13 @@ class Doubts:
         Args:
             new: edges just added, which are doubted so far.
         """
-        suspects = self._suspects(equations)
+        suspects, fresh = self._suspects(equations), set(new)
         went_before: set[EdgeId] = set()
         unseen = 1  # of the doubted ones, to be looked at before the graph is at rest
         for _ in range(ROUNDS + len(new)):
             if unseen <= 0:
                 return
-            again = list(islice((i for i in equations.doubted if i not in new), CHECKED))
+            again = list(islice((i for i in equations.doubted if i not in fresh), CHECKED))
             for i in again:  # to the end of the queue
                 equations.doubted[i] = equations.doubted.pop(i)
             unseen -= CHECKED
@@ -86,21 +86,26 @@ class Doubts:
                 unseen = len(equations.doubted) + 1
 
     def _let_in(self, equations: Equations, waiting: Sequence[EdgeId]) -> list[EdgeId]:
-        """All that the estimate agrees with, or else the first one that its uncertainty explains."""
+        """All that the estimate agrees with, or else the first that its uncertainty explains, and all of sightings."""
         misfits = {i: equations.misfit(equations.edges[i]) for i in waiting}
         near = [i for i, chi2 in misfits.items() if chi2 <= FULL_WEIGHT[len(equations.edges[i].covariance)]]
         if near:
             equations.believe(near)
             return near
-        for i, chi2 in misfits.items():
-            if chi2 < NEARER * equations.doubted[i]:
-                equations.doubted[i] = chi2
-                if _is_told_true(equations, equations.edges[i]):
-                    # At its full weight first: the kernel, which does not know of the drift, would hold it off.
-                    equations.believe([i], kernel=False)
-                    equations.put_under_kernel([i])
-                    return [i]
-        return []
+        nearer = [i for i, chi2 in misfits.items() if chi2 < NEARER * equations.doubted[i]]
+        innovations = equations.innovations([equations.edges[i] for i in nearer])
+        come: list[EdgeId] = []
+        for i, innovation in zip(nearer, innovations, strict=True):
+            edge = equations.edges[i]
+            if not come:
+                equations.doubted[i] = misfits[i]
+            if (not come or edge.kind in FUSED) and _is_told_true(equations, edge, *innovation):
+                come.append(i)
+        if come:
+            # At their full weight first: the kernel, which does not know of the drift, would hold them off.
+            equations.believe(come, kernel=False)
+            equations.put_under_kernel(come)
+        return come
 
     def _let_in_together(self, equations: Equations, new: Iterable[EdgeId]) -> list[EdgeId]:
         """The first set of edges around a new one that agree with each other and with what cannot be false."""
@@ -150,12 +155,11 @@ def _agree(chi2: float, covariance: FloatArray) -> bool:
     return chi2 <= GATE[len(covariance)] and chance(covariance) < DISTINCT
 
 
-def _is_told_true(equations: Equations, edge: GraphEdge) -> bool:
-    """Whether the estimate explains an edge, and would hardly explain a false one.
+def _is_told_true(equations: Equations, edge: GraphEdge, chi2: float, covariance: FloatArray) -> bool:
+    """Whether the estimate explains an edge, given its innovation, and would hardly explain a false one.
 
     What sightings fuse to was chosen among all others with the same care (``consistency``).
     """
-    chi2, covariance = equations.innovation(edge)
     if chi2 > GATE[len(covariance)]:
         return False
     passing = 0.0 if edge.kind in FUSED else chance(covariance)

@@ -1,7 +1,7 @@
 """What a graph believes, as equations: its edges that are not doubted, their factors, and the poses that fit them."""
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -41,21 +41,24 @@ class Equations:
         """joint_T_vertex."""
         return self._smoother.pose(self._keys[vertex])
 
-    def relative(self, a: VertexId, b: VertexId) -> UncertainPose:
-        """a_T_b, covariance in the frame of b."""
-        covariance = np.zeros((3, 3)) if a == b else self._smoother.relative_covariance(self._keys[a], self._keys[b])
-        return UncertainPose(self.pose(a).between(self.pose(b)), covariance)
+    def relatives(self, pairs: Sequence[tuple[VertexId, VertexId]]) -> list[UncertainPose]:
+        """a_T_b of every pair, covariance in the frame of b."""
+        covariances = self._smoother.relative_covariances([(self._keys[a], self._keys[b]) for a, b in pairs])
+        poses = (self.pose(a).between(self.pose(b)) for a, b in pairs)
+        return [UncertainPose(pose, covariance) for pose, covariance in zip(poses, covariances, strict=True)]
 
     def misfit(self, edge: GraphEdge) -> float:
         """chi2 of an edge at the estimate over its own covariance."""
         return misfit(edge, self.pose(edge.tail), self.pose(edge.head))
 
-    def innovation(self, edge: GraphEdge) -> tuple[float, FloatArray]:
-        """chi2 of an edge that is not believed over its covariance and the estimate's together, and that sum."""
-        pose, known = self.relative(edge.tail, edge.head)
-        residual, jacobian = edge.residual(pose)
-        covariance = edge.covariance + jacobian @ known @ jacobian.T
-        return float(residual @ np.linalg.solve(covariance, residual)), covariance
+    def innovations(self, edges: Sequence[GraphEdge]) -> list[tuple[float, FloatArray]]:
+        """Of edges that are not believed chi2 over their covariance and the estimate's together, and that sum."""
+        found = []
+        for edge, (pose, known) in zip(edges, self.relatives([(e.tail, e.head) for e in edges]), strict=True):
+            residual, jacobian = edge.residual(pose)
+            covariance = edge.covariance + jacobian @ known @ jacobian.T
+            found.append((float(residual @ np.linalg.solve(covariance, residual)), covariance))
+        return found
 
     def cost(self) -> float:
         """The sum of chi2 of all that is believed, without kernels."""

@@ -1,6 +1,6 @@
 """The joint graph: the vertices and edges of one connected component, and the poses that fit them best."""
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -157,6 +157,10 @@ class JointGraph:
         pose = self._smoother.pose(start).between(self._smoother.pose(end))
         return UncertainPose(pose, self._smoother.covariance_seen_from(start, end))
 
+    def relatives(self, pairs: Sequence[tuple[VertexId, VertexId]]) -> list[UncertainPose]:
+        """``relative`` of many pairs: about one elimination of the graph for all of them."""
+        return self._equations().relatives([(a, b) for a, b in pairs if self._key(a) >= 0 and self._key(b) >= 0])
+
     def innovation(self, edge: GraphEdge) -> float:
         """How far an edge that is not in the graph is from what the graph expects: chi2, a degree of freedom a number.
 
@@ -165,7 +169,7 @@ class JointGraph:
         """
         for end in (edge.tail, edge.head):
             self._key(end)
-        return self._equations().innovation(edge)[0]
+        return self._equations().innovations([edge])[0][0]
 
     def chi2(self, edge_id: EdgeId) -> float:
         """Squared residual of an edge at the present estimate over its own covariance, without its kernel.

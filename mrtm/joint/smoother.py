@@ -7,7 +7,7 @@ is such a one). From then on QR, which solves those too and takes up to twice as
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 import gtsam
@@ -52,6 +52,8 @@ _NEVER = 2**31 - 1  # updates
 
 # Factors in all the eliminations that are kept for further questions, seen from one pose each: about 10 kB a factor.
 _KEPT = 1_000
+
+_TOGETHER = 64  # pairs of poses whose covariance is found at once
 
 # Standard deviation that stands for "this pose is the reference": nothing against any measurement.
 _REFERENCE_SIGMA = 1e-6
@@ -176,15 +178,38 @@ class Smoother:
                 del self._seen_from[next(iter(self._seen_from))]
         return _symmetric(self._seen_from[reference].marginalCovariance(key))
 
-    def relative_covariance(self, reference: int, key: int) -> FloatArray:
-        """As ``covariance_seen_from``, from iSAM2's own joint marginal: near the newest keys a hundred times faster.
+    def relative_covariances(self, pairs: Sequence[tuple[int, int]]) -> list[FloatArray]:
+        """As ``covariance_seen_from``, for every pair of a reference and a key, which may be the same.
 
-        As far as iSAM2 has linearised anew, so good to a part in a thousand or so.
+        Of a single pair it comes from iSAM2's own joint marginal: near the newest keys that is a hundred times faster
+        than to eliminate all, and good to a part in a thousand or so, as far as iSAM2 has linearised anew. Of several
+        it comes from one elimination of the graph for all.
         """
-        joint = self._isam.jointMarginalCovariance([reference, key])
+        if len(pairs) == 1 and pairs[0][0] != pairs[0][1]:
+            joint = self._isam.jointMarginalCovariance(list(pairs[0]))
+            return [self._seen(*pairs[0], joint.at)]
+        return [
+            covariance
+            for first in range(0, len(pairs), _TOGETHER)
+            for covariance in self._eliminated(pairs[first : first + _TOGETHER])
+        ]
+
+    def _eliminated(self, pairs: Sequence[tuple[int, int]]) -> list[FloatArray]:
+        """``relative_covariances`` of so many that all their keys have room in one dense matrix."""
+        linear = self._isam.getFactorsUnsafe().linearize(self.values())
+        function = [gtsam.EliminateQR] if self._factorization == "QR" else []
+        net = linear.marginalMultifrontalBayesNet(sorted({key for pair in pairs for key in pair}), *function)
+        rows = {net.at(place).keys()[0]: slice(3 * place, 3 * place + 3) for place in range(net.size())}
+        root = np.linalg.inv(net.matrix()[0])
+        return [self._seen(*pair, lambda a, b: root[rows[a]] @ root[rows[b]].T) for pair in pairs]
+
+    def _seen(self, reference: int, key: int, joint: Callable[[int, int], FloatArray]) -> FloatArray:
+        """(3, 3) covariance of reference_T_key, in the frame of ``key``, from blocks of the joint covariance."""
+        if reference == key:
+            return np.zeros((3, 3))
         carry = -self.pose(key).between(self.pose(reference)).AdjointMap()
-        cross = carry @ joint.at(reference, key)
-        return _symmetric(carry @ joint.at(reference, reference) @ carry.T + cross + cross.T + joint.at(key, key))
+        cross = carry @ joint(reference, key)
+        return _symmetric(carry @ joint(reference, reference) @ carry.T + cross + cross.T + joint(key, key))
 
     def _start(self, factors: Mapping[EdgeId, gtsam.NoiseModelFactor], values: gtsam.Values) -> None:
         try:

@@ -349,7 +349,7 @@ def test_votes_are_the_chi2_of_a_loop_through_both_maps() -> None:
             near, far, offset = far, near, inverse(offset)
 
         def moved(a: VertexId, b: VertexId) -> UncertainPose:
-            return world.graphs[a.robot].relative(a, b)
+            return world.graphs[a.robot].relatives([(a, b)])[0]
 
         seen = compose(compose(moved(tail, near), offset), moved(far, head))
         residual = gtsam.Pose2.Logmap(seen.pose.between(gtsam.Pose2(*s.measured[k])))

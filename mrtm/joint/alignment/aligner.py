@@ -6,11 +6,12 @@ when the estimate has moved so far that the old answer was to another question.
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 
 import gtsam
 import numpy as np
 
-from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId, inverse
+from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
 from mrtm.joint.alignment.align import Alignment, align
 from mrtm.joint.alignment.candidates import Candidate, pairs
 from mrtm.joint.alignment.surface import Surface
@@ -92,20 +93,19 @@ class Aligner:
         looks = SCREENED * most
         asked: dict[Pair, UncertainPose] = {}
 
-        def relative(a: VertexId, b: VertexId) -> UncertainPose:
-            guess = graph.relative(a, b)
-            asked[min(a, b), max(a, b)] = guess if a < b else inverse(guess)
-            return guess
+        def relatives(pairs: list[Pair]) -> list[UncertainPose]:
+            guesses = graph.relatives(pairs)
+            asked.update(zip(pairs, guesses, strict=True))
+            return guesses
 
-        near = pairs(closed, poses, relative, wanted, most=looks, looks=looks)
+        near = pairs(closed, poses, relatives, wanted, most=looks, looks=looks)
         for a, b in asked.keys() - {(c.a, c.b) for c in near}:
             self.attempts[a, b] = Attempt((closed[a], closed[b]), asked[a, b], None, None, "they hardly overlap")
         due = [c for c in near if self._due((c.a, c.b), (closed[c.a], closed[c.b]), c.guess)][:most]
-        for pair in [p for p, a in self.attempts.items() if not a.edge and {*p} <= closed.keys()][
-            : 0 if due else AGAIN
-        ]:
+        refused = (p for p, a in self.attempts.items() if not a.edge and {*p} <= closed.keys())
+        again = list(islice(refused, 0 if due else AGAIN))
+        for pair, guess in zip(again, graph.relatives(again), strict=True):
             self.attempts[pair] = self.attempts.pop(pair)  # the next time it is another's turn
-            guess = relative(*pair)
             if self._due(pair, (closed[pair[0]], closed[pair[1]]), guess):
                 due.append(Candidate(*pair, guess))
         for a, b, guess in due:

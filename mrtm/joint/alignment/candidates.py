@@ -1,6 +1,5 @@
 """Which closed maps are worth aligning after an event: those that are likely to overlap, not all pairs of all."""
 
-from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from itertools import islice
@@ -9,7 +8,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from factors import UncertainPose, VertexId, inverse
+from factors import UncertainPose, VertexId
 from frontend import se2
 from frontend.records import FloatArray
 from mrtm.joint.alignment.agreement import overlap
@@ -32,7 +31,7 @@ class Candidate(NamedTuple):
 def pairs(
     maps: Mapping[VertexId, Surface],
     poses: Mapping[VertexId, gtsam.Pose2],
-    relative: Callable[[VertexId, VertexId], UncertainPose],
+    relatives: Callable[[list[tuple[VertexId, VertexId]]], list[UncertainPose]],
     wanted: Callable[[VertexId, VertexId], bool] = lambda a, b: True,
     most: int = MOST,
     looks: int | None = None,
@@ -42,8 +41,7 @@ def pairs(
     Args:
         maps: of closed vertices of one component.
         poses: joint_T_local of at least these.
-        relative: a_T_b and its covariance in the frame of b, such as ``JointGraph.relative``; asked of near pairs only,
-            in either order.
+        relatives: a_T_b and its covariance in the frame of b, such as ``JointGraph.relatives``; asked of near pairs.
         wanted: whether a pair, a before b, is worth a look at all. All by default.
         most: pairs at most.
         looks: pairs that are asked about, those of the nearest maps; all by default.
@@ -57,14 +55,10 @@ def pairs(
     i, k = np.nonzero(np.triu(apart <= MAX_XY, 1))
     found: list[tuple[float, Candidate]] = []
     nearest = ((int(i[place]), int(k[place])) for place in np.argsort(apart[i, k], kind="stable"))
-    asked = list(islice(((a, b) for a, b in nearest if wanted(vertices[a], vertices[b])), looks))
-    often = Counter(end for pair in asked for end in pair)
-    # From the end that is in more pairs: the first question from a vertex takes long.
-    start = {pair: max(pair, key=often.__getitem__) for pair in asked}
-    for row, column in sorted(asked, key=lambda pair: (start[pair], pair)):
-        a, b, distance = vertices[row], vertices[column], apart[row, column]
-        guess = relative(a, b) if start[row, column] == row else inverse(relative(b, a))
-        if distance > 3.0 * np.sqrt(np.linalg.eigvalsh(guess.covariance[:2, :2])[1]):
+    asked = list(islice(((r, c) for r, c in nearest if wanted(vertices[r], vertices[c])), looks))
+    ends = [(vertices[row], vertices[column]) for row, column in asked]
+    for place, (a, b), guess in zip(asked, ends, relatives(ends), strict=True):
+        if apart[place] > 3.0 * np.sqrt(np.linalg.eigvalsh(guess.covariance[:2, :2])[1]):
             continue
         area = _likely_overlap(maps[a], maps[b], guess)
         if area >= LEAST_OVERLAP:

@@ -8,6 +8,7 @@ noise is counted with every sighting as if it were its own: they are far more ce
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import combinations
 from typing import NamedTuple, Protocol
 from weakref import WeakValueDictionary
 
@@ -92,8 +93,8 @@ class RobotGraph(Protocol):
     def estimate(self, vertex: VertexId) -> gtsam.Pose2:
         """The pose of a vertex in the robot's own frame."""
 
-    def relative(self, a: VertexId, b: VertexId) -> UncertainPose:
-        """a_T_b with its covariance in the frame of b."""
+    def relatives(self, pairs: Sequence[tuple[VertexId, VertexId]]) -> list[UncertainPose]:
+        """a_T_b with its covariance in the frame of b, for every pair."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -124,12 +125,12 @@ class OwnMap:
         m = len(vertices)
         poses = np.array([coordinates(graph.estimate(vertex)) for vertex in vertices])
         relative, covariances = np.zeros((m, m, 3)), np.zeros((m, m, 3, 3))
-        for i in range(m):
-            for k in range(i + 1, m):
-                seen = graph.relative(vertices[i], vertices[k])
-                back = inverse(seen)
-                relative[i, k], covariances[i, k] = coordinates(seen.pose), seen.covariance
-                relative[k, i], covariances[k, i] = coordinates(back.pose), back.covariance
+        pairs = list(combinations(range(m), 2))
+        seen = graph.relatives([(vertices[i], vertices[k]) for i, k in pairs])
+        for (i, k), there in zip(pairs, seen, strict=True):
+            back = inverse(there)
+            relative[i, k], covariances[i, k] = coordinates(there.pose), there.covariance
+            relative[k, i], covariances[k, i] = coordinates(back.pose), back.covariance
         return cls(vertices, poses, relative, covariances, _tree(covariances))
 
     def among(self, wanted: Iterable[VertexId]) -> "OwnMap":

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
 
 from factors import UncertainPose, VertexId
@@ -166,8 +165,7 @@ class _Around(NamedTuple):
 
 @lru_cache(512)
 def _seen_from(graph: RobotGraph, vertex: VertexId, others: tuple[VertexId, ...]) -> _Around:
-    here = UncertainPose(gtsam.Pose2(), np.zeros((3, 3)))
-    seen = [here if v == vertex else graph.relative(vertex, v) for v in others]
+    seen = graph.relatives([(vertex, v) for v in others])
     return _Around(np.array([coordinates(s.pose) for s in seen]), np.array([s.covariance for s in seen]))
 
 
