@@ -24,6 +24,7 @@ from mrtm.joint.agreeing import agreeing, clique
 from mrtm.joint.equations import CERTAIN, FUSED, Equations
 from mrtm.joint.sightings.innovation import share_passing
 from mrtm.joint.sightings.pairs import LEAST_SUPPORT, outnumbers
+from mrtm.joint.smoother import TOGETHER
 
 GATE = {2: 26.99, 3: 30.0}
 """chi2 of so many degrees of freedom that a true edge has at most: one in 720,000 has more. Loops of real logs need
@@ -86,26 +87,20 @@ class Doubts:
                 unseen = len(equations.doubted) + 1
 
     def _let_in(self, equations: Equations, waiting: Sequence[EdgeId]) -> list[EdgeId]:
-        """All that the estimate agrees with, or else the first that its uncertainty explains, and all of sightings."""
+        """All that the estimate agrees with, or else those that its uncertainty explains."""
         misfits = {i: equations.misfit(equations.edges[i]) for i in waiting}
         near = [i for i, chi2 in misfits.items() if chi2 <= FULL_WEIGHT[len(equations.edges[i].covariance)]]
         if near:
             equations.believe(near)
             return near
         nearer = [i for i, chi2 in misfits.items() if chi2 < NEARER * equations.doubted[i]]
-        innovations = equations.innovations([equations.edges[i] for i in nearer])
-        come: list[EdgeId] = []
-        for i, innovation in zip(nearer, innovations, strict=True):
-            edge = equations.edges[i]
-            if not come:
-                equations.doubted[i] = misfits[i]
-            if (not come or edge.kind in FUSED) and _is_told_true(equations, edge, *innovation):
-                come.append(i)
-        if come:
-            # At their full weight first: the kernel, which does not know of the drift, would hold them off.
-            equations.believe(come, kernel=False)
-            equations.put_under_kernel(come)
-        return come
+        for first in range(0, len(nearer), TOGETHER):
+            if true := _told_true(equations, nearer[first : first + TOGETHER]):
+                # At their full weight first: the kernel, which does not know of the drift, would hold them off.
+                equations.believe(true, kernel=False)
+                equations.put_under_kernel(true)
+                return true
+        return []
 
     def _let_in_together(self, equations: Equations, new: Iterable[EdgeId]) -> list[EdgeId]:
         """The first set of edges around a new one that agree with each other and with what cannot be false."""
@@ -155,6 +150,21 @@ def _agree(chi2: float, covariance: FloatArray) -> bool:
     return chi2 <= GATE[len(covariance)] and chance(covariance) < DISTINCT
 
 
+def _told_true(equations: Equations, ids: Sequence[EdgeId]) -> list[EdgeId]:
+    """Those of some doubted edges that the estimate explains, each after those before it have come in."""
+    edges, true = [equations.edges[i] for i in ids], []
+    expectation = equations.expectation(edges)
+    for n, edge in enumerate(edges):
+        equations.doubted[edge.id] = math.inf  # not judged
+        chi2 = expectation.misfit(n)
+        if chi2 <= FULL_WEIGHT[len(edge.covariance)] or _is_told_true(equations, edge, *expectation.innovation(n)):
+            true.append(edge.id)
+            expectation.take(n)
+        else:
+            equations.doubted[edge.id] = chi2
+    return true
+
+
 def _is_told_true(equations: Equations, edge: GraphEdge, chi2: float, covariance: FloatArray) -> bool:
     """Whether the estimate explains an edge, given its innovation, and would hardly explain a false one.
 
@@ -167,10 +177,10 @@ def _is_told_true(equations: Equations, edge: GraphEdge, chi2: float, covariance
 
 
 def _share_of_false(equations: Equations) -> float:
-    """Of the edges that may be false; the one that is being judged is among the doubted ones and does not count."""
+    """Of the edges that may be false, as far as they have been judged."""
     count = sum(edge.kind not in CERTAIN for edge in equations.edges.values())
     judged = sum(chi2 < math.inf for chi2 in equations.doubted.values())
-    return (PRIOR + judged - 1) / count
+    return (PRIOR + judged) / count
 
 
 def _contradicted(equations: Equations, members: Sequence[EdgeId]) -> list[EdgeId] | None:

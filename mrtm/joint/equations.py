@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 
 from factors import EdgeId, EdgeKind, GraphEdge, UncertainPose, VertexId, factor_of, without_kernel
-from factors.noise import FloatArray
+from mrtm.joint.expectation import Expectation
 from mrtm.joint.smoother import Smoother
 
 CERTAIN = {EdgeKind.INTER_VERTEX, EdgeKind.COVARIANCE_INTERSECTION}
@@ -51,14 +51,10 @@ class Equations:
         """chi2 of an edge at the estimate over its own covariance."""
         return misfit(edge, self.pose(edge.tail), self.pose(edge.head))
 
-    def innovations(self, edges: Sequence[GraphEdge]) -> list[tuple[float, FloatArray]]:
-        """Of edges that are not believed chi2 over their covariance and the estimate's together, and that sum."""
-        found = []
-        for edge, (pose, known) in zip(edges, self.relatives([(e.tail, e.head) for e in edges]), strict=True):
-            residual, jacobian = edge.residual(pose)
-            covariance = edge.covariance + jacobian @ known @ jacobian.T
-            found.append((float(residual @ np.linalg.solve(covariance, residual)), covariance))
-        return found
+    def expectation(self, edges: Sequence[GraphEdge]) -> Expectation:
+        """Of edges that are not believed, TOGETHER or fewer."""
+        known = self._smoother.joint_covariance([(self._keys[e.tail], self._keys[e.head]) for e in edges])
+        return Expectation(edges, [self.pose(e.tail).between(self.pose(e.head)) for e in edges], known)
 
     def cost(self) -> float:
         """The sum of chi2 of all that is believed, without kernels."""

@@ -169,7 +169,7 @@ class JointGraph:
         """
         for end in (edge.tail, edge.head):
             self._key(end)
-        return self._equations().innovations([edge])[0][0]
+        return self._equations().expectation([edge]).innovation(0)[0]
 
     def chi2(self, edge_id: EdgeId) -> float:
         """Squared residual of an edge at the present estimate over its own covariance, without its kernel.

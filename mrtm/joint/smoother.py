@@ -53,7 +53,7 @@ _NEVER = 2**31 - 1  # updates
 # Factors in all the eliminations that are kept for further questions, seen from one pose each: about 10 kB a factor.
 _KEPT = 1_000
 
-_TOGETHER = 64  # pairs of poses whose covariance is found at once
+TOGETHER = 64  # pairs of poses whose covariance is found at once
 
 # Standard deviation that stands for "this pose is the reference": nothing against any measurement.
 _REFERENCE_SIGMA = 1e-6
@@ -186,30 +186,32 @@ class Smoother:
         it comes from one elimination of the graph for all.
         """
         if len(pairs) == 1 and pairs[0][0] != pairs[0][1]:
-            joint = self._isam.jointMarginalCovariance(list(pairs[0]))
-            return [self._seen(*pairs[0], joint.at)]
-        return [
-            covariance
-            for first in range(0, len(pairs), _TOGETHER)
-            for covariance in self._eliminated(pairs[first : first + _TOGETHER])
-        ]
+            a, b = pairs[0]
+            joint, carry = self._isam.jointMarginalCovariance([a, b]), self._carry(a, b)
+            cross = carry @ joint.at(a, b)
+            return [_symmetric(carry @ joint.at(a, a) @ carry.T + cross + cross.T + joint.at(b, b))]
+        together = (pairs[first : first + TOGETHER] for first in range(0, len(pairs), TOGETHER))
+        return [root @ root.T for some in together for root in self._roots(some)]
 
-    def _eliminated(self, pairs: Sequence[tuple[int, int]]) -> list[FloatArray]:
-        """``relative_covariances`` of so many that all their keys have room in one dense matrix."""
+    def joint_covariance(self, pairs: Sequence[tuple[int, int]]) -> FloatArray:
+        """(3 n, 3 n) ``relative_covariances`` of n pairs, TOGETHER or fewer, with what lies between them."""
+        if len(pairs) == 1:
+            return self.relative_covariances(pairs)[0]
+        roots = self._roots(pairs).reshape(3 * len(pairs), -1)
+        return np.asarray(roots @ roots.T)
+
+    def _roots(self, pairs: Sequence[tuple[int, int]]) -> FloatArray:
+        """(n, 3, k) A of n pairs: the covariance between the relative poses i and j is A_i A_j'."""
         linear = self._isam.getFactorsUnsafe().linearize(self.values())
         function = [gtsam.EliminateQR] if self._factorization == "QR" else []
         net = linear.marginalMultifrontalBayesNet(sorted({key for pair in pairs for key in pair}), *function)
         rows = {net.at(place).keys()[0]: slice(3 * place, 3 * place + 3) for place in range(net.size())}
         root = np.linalg.inv(net.matrix()[0])
-        return [self._seen(*pair, lambda a, b: root[rows[a]] @ root[rows[b]].T) for pair in pairs]
+        return np.array([root[rows[b]] + self._carry(a, b) @ root[rows[a]] for a, b in pairs])
 
-    def _seen(self, reference: int, key: int, joint: Callable[[int, int], FloatArray]) -> FloatArray:
-        """(3, 3) covariance of reference_T_key, in the frame of ``key``, from blocks of the joint covariance."""
-        if reference == key:
-            return np.zeros((3, 3))
-        carry = -self.pose(key).between(self.pose(reference)).AdjointMap()
-        cross = carry @ joint(reference, key)
-        return _symmetric(carry @ joint(reference, reference) @ carry.T + cross + cross.T + joint(key, key))
+    def _carry(self, reference: int, key: int) -> FloatArray:
+        """(3, 3) what a step of ``reference`` does to reference_T_key."""
+        return np.asarray(-self.pose(key).between(self.pose(reference)).AdjointMap())
 
     def _start(self, factors: Mapping[EdgeId, gtsam.NoiseModelFactor], values: gtsam.Values) -> None:
         try:

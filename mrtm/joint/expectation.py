@@ -1,0 +1,52 @@
+"""What a graph expects edges to measure that it does not believe, each by itself or after others have come in."""
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from factors import GraphEdge
+from factors.noise import FloatArray
+
+
+class Expectation:
+    """Edges may be taken in one after the other; what is expected of the rest follows, as far as it is linear.
+
+    Args:
+        edges: n, which the estimate does not know of.
+        poses: the relative pose of the ends of each, as estimated.
+        known: (3 n, 3 n) the covariance of all these poses together, each in the frame of its head.
+    """
+
+    def __init__(self, edges: Sequence[GraphEdge], poses: Sequence[gtsam.Pose2], known: FloatArray) -> None:
+        residuals, jacobians = zip(*(e.residual(pose) for e, pose in zip(edges, poses, strict=True)), strict=True)
+        ends = np.cumsum([0, *map(len, residuals)]).tolist()
+        self._rows = [slice(*both) for both in zip(ends, ends[1:], strict=False)]
+        self._residual = np.concatenate(residuals)
+        self._covariance = np.zeros((ends[-1], ends[-1]))
+        for n, rows in enumerate(self._rows):
+            for m, columns in enumerate(self._rows):
+                block = known[3 * n : 3 * n + 3, 3 * m : 3 * m + 3]
+                self._covariance[rows, columns] = jacobians[n] @ block @ jacobians[m].T
+        self._noise = [e.covariance for e in edges]
+
+    def misfit(self, n: int) -> float:
+        """chi2 of edge ``n`` over its own covariance."""
+        return _chi2(self._residual[self._rows[n]], self._noise[n])
+
+    def innovation(self, n: int) -> tuple[float, FloatArray]:
+        """chi2 of edge ``n`` over its covariance and the estimate's together, and that sum."""
+        rows = self._rows[n]
+        total = self._noise[n] + self._covariance[rows, rows]
+        return _chi2(self._residual[rows], total), total
+
+    def take(self, n: int) -> None:
+        """Let the estimate know of edge ``n``."""
+        rows = self._rows[n]
+        gain = np.linalg.solve(self._noise[n] + self._covariance[rows, rows], self._covariance[rows]).T
+        self._residual = self._residual - gain @ self._residual[rows]
+        self._covariance = self._covariance - gain @ self._covariance[rows]
+
+
+def _chi2(residual: FloatArray, covariance: FloatArray) -> float:
+    return float(residual @ np.linalg.solve(covariance, residual))
