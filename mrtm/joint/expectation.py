@@ -1,6 +1,7 @@
 """What a graph expects edges to measure that it does not believe, each by itself or after others have come in."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -21,7 +22,7 @@ class Expectation:
     def __init__(self, edges: Sequence[GraphEdge], poses: Sequence[gtsam.Pose2], known: FloatArray) -> None:
         residuals, jacobians = zip(*(e.residual(pose) for e, pose in zip(edges, poses, strict=True)), strict=True)
         ends = np.cumsum([0, *map(len, residuals)]).tolist()
-        self._rows = [slice(*both) for both in zip(ends, ends[1:], strict=False)]
+        self._rows = [slice(*both) for both in pairwise(ends)]
         self._residual = np.concatenate(residuals)
         self._covariance = np.zeros((ends[-1], ends[-1]))
         for n, rows in enumerate(self._rows):

@@ -84,26 +84,30 @@ class JointMap:
                 continue
             known[edge.id] = edge
             changed.add(edge.id.robot)
+        news: dict[tuple[str, ...], list[tuple[JointGraph, JointGraph]]] = {}
         for robot in sorted(changed):
-            self._enter(robot)
+            graph = self._own.get(robot)
+            own = tuple(edge for _, edge in sorted(self._edges.get(robot, {}).items()))
+            self._own[robot], refused = own_graph(robot, own)
+            self.refused |= refused
+            if graph is None or self._component[robot].graph is graph:
+                self._apart([robot])
+            else:
+                news.setdefault(self._component[robot].robots, []).append((graph, self._own[robot]))
+        for robots, graphs in news.items():
+            self._follow(self._component[robots[0]], graphs)
 
-    def _enter(self, robot: str) -> None:
-        """Solve a robot's edges, and bring its component up to date."""
-        edges = tuple(edge for _, edge in sorted(self._edges.get(robot, {}).items()))
-        before = self._own.get(robot)
-        self._own[robot], refused = own_graph(robot, edges)
-        self.refused |= refused
-        if before is None or self._component[robot].graph is before:
-            self._apart([robot])
-            return
-        component = self._component[robot]
-        was, now = ({edge.id: edge for edge in graph.edges()} for graph in (before, self._own[robot]))
+    def _follow(self, component: Component, graphs: Iterable[tuple[JointGraph, JointGraph]]) -> None:
+        """Bring a component up to date with robots' own graphs, as they were and as they are."""
+        before, after = zip(*graphs, strict=True)
+        was, now = ({edge.id: edge for graph in some for edge in graph.edges()} for some in (before, after))
         try:
             component.graph.update(
                 add=[edge for i, edge in now.items() if i not in was],
                 replace=[edge for i, edge in now.items() if i in was and edge.version > was[i].version],
                 remove=[i for i in was if i not in now],
-                remove_vertices=set(before.vertices()) - set(self._own[robot].vertices()),
+                remove_vertices={v for graph in before for v in graph.vertices()}
+                - {v for graph in after for v in graph.vertices()},
             )
         except GraphError:
             self._apart(component.robots)  # ``join`` makes it anew

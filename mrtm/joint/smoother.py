@@ -118,9 +118,10 @@ class Smoother:
                 self._solve(lambda: self._insert({}, gtsam.Values(), (), None))
             return
         for _ in range(_MAX_STEPS):
-            if self._settled or self._solve(lambda: self._insert({}, gtsam.Values(), (), None)) == 0:
+            if self._settled or np.abs(self._isam.getDelta().vector()).max() < self._tolerance.shift:
                 self._settled = True
                 return
+            self._solve(lambda: self._insert({}, gtsam.Values(), (), None))
         self.refine()
 
     def refine(self) -> None:
