@@ -1,9 +1,13 @@
-"""What tests share: where the real logs are."""
+"""What tests share: where the real logs are, and that no example has to be found in time: machines are noisy."""
 
 import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("mrtm", deadline=None)
+settings.load_profile("mrtm")
 
 ROOT = Path(__file__).parents[1]
 PLACES = (os.environ.get("MRTM_DATA", ""), ROOT.parent / "shared" / "data", ROOT / "data" / "cache")

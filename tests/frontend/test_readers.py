@@ -84,7 +84,7 @@ def test_a_file_cut_off_gives_what_it_holds(tmp_path: Path, compression: str) ->
 
 
 @pytest.mark.parametrize("compression", COMPRESS)
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(where=st.floats(0, 1), flip=st.booleans())
 def test_truncation_and_damage_anywhere_end_in_scans_or_one_error(
     tmp_path: Path, compression: str, where: float, flip: bool
@@ -101,7 +101,7 @@ def test_truncation_and_damage_anywhere_end_in_scans_or_one_error(
         assert all(np.isfinite(scan.time) and np.isfinite(scan.odometry).all() for scan in got)
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     body=st.lists(
         st.one_of(

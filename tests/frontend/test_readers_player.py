@@ -238,7 +238,7 @@ def test_a_log_cut_anywhere_gives_what_it_holds(tmp_path: Path) -> None:
     assert most == 5  # the sixth lacks the end of its line
 
 
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     body=st.lists(
         st.one_of(

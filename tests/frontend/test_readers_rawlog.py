@@ -290,7 +290,7 @@ def test_a_log_cut_inside_an_object_says_so(tmp_path: Path) -> None:
     assert log.report.damage == "it ends in the middle of object 12, a CObservation2DRangeScan"
 
 
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_any_change_ends_in_scans_or_one_error(tmp_path: Path, data: st.DataObject) -> None:
     whole = bytearray(poses_of_frames(NEW, 7, 5, 1) + STRANGER + NEW.odometry((0, 0, 0), 1) + NEW.scan(RANGES, 2, 3))

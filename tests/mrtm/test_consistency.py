@@ -86,7 +86,7 @@ def test_headings_of_some_are_enough() -> None:
 
 
 @given(seed=st.integers(0, 10**6), count=st.integers(1, 40))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_false_sightings_alone_never_merge(seed: int, count: int) -> None:
     world = TeamWorld(seed, 2)
     world.sight("r0", "r1", count, false=1.0)
@@ -168,7 +168,7 @@ def test_of_a_cycle_that_does_not_close_a_pair_about_as_strong_waits() -> None:
 
 
 @given(seed=st.integers(0, 1000), order=st.randoms(use_true_random=False))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_the_outcome_does_not_depend_on_the_order(seed: int, order: random.Random) -> None:
     world = TeamWorld(seed, 3)
     for a, b in itertools.combinations(world.names, 2):

@@ -236,7 +236,7 @@ def test_the_merge_is_a_join(rows: list[tuple[Kind, int, int, int]], data: st.Da
     assert same(a, store_of(*parts[1], *parts[0]))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.integers(0, 2**32), st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4), st.integers(0, 12)), max_size=40)
 )

@@ -64,7 +64,7 @@ def whole() -> JointMap:
     return told(EDGES, JOINS)
 
 
-@settings(max_examples=25, deadline=None, phases=[Phase.generate])
+@settings(max_examples=25, phases=[Phase.generate])
 @given(st.data())
 def test_any_order_repetitions_and_old_versions_come_to_the_same(whole: JointMap, data: st.DataObject) -> None:
     """In any portions, joined in between or not, old versions after new ones."""

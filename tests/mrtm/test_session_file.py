@@ -265,7 +265,7 @@ _ROBOTS = st.dictionaries(
 
 
 @given(_ROBOTS)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_sessions_survive_being_written(
     tmp_path_factory: pytest.TempPathFactory, robots: dict[str, tuple[float, float | None, float]]
 ) -> None:
@@ -296,7 +296,7 @@ _SIGHTINGS = st.builds(
 
 
 @given(st.lists(_SIGHTINGS, unique=True, max_size=8), st.permutations(COLUMNS))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_sightings_survive_being_written(
     tmp_path_factory: pytest.TempPathFactory, seen: list[TimedSighting], columns: list[str]
 ) -> None:

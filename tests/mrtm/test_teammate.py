@@ -66,7 +66,7 @@ def writer(record: Record) -> str:
 # Convergence.
 
 
-@settings(max_examples=8, deadline=None, phases=[Phase.generate])  # a seed need not be small
+@settings(max_examples=8, phases=[Phase.generate])  # a seed need not be small
 @given(st.integers(0, 2**32), st.floats(0.0, 0.6))
 def test_five_robots_end_with_the_same_joint_map_however_they_met(seed: int, loss: float) -> None:
     """Records come in bits, meetings are of any pairs in any order, messages get lost, doubled and relayed."""

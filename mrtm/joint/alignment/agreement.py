@@ -102,12 +102,10 @@ class Lookup:
     def of(cls, local_map: SurfaceMap) -> "Lookup":
         """Sort the cells of a local map."""
         grid = local_map.grid
-        known = np.abs(grid.log_odds) > UNKNOWN
-        kinds = np.where(known, _OTHER, _UNKNOWN).astype(np.uint8)
-        kinds[grid.log_odds <= FREE] = _CLEAR
-        _spread(np.argwhere(grid.log_odds > 0.0), CLEAR / grid.resolution, NEAR / grid.resolution, kinds)
+        kinds = np.empty(grid.log_odds.shape, np.uint8)
+        _sort(grid.log_odds, CLEAR / grid.resolution, NEAR / grid.resolution, kinds)
         step = -(-len(local_map.cloud) // _MOST_POINTS) or 1
-        rows, columns = np.nonzero(known[::_AREA_STEP, ::_AREA_STEP])
+        rows, columns = np.nonzero(np.abs(grid.log_odds[::_AREA_STEP, ::_AREA_STEP]) > UNKNOWN)
         area = grid.origin + grid.resolution * (_AREA_STEP * np.column_stack([columns, rows]) + 0.5)
         points, normals = local_map.cloud[::step], local_map.normals[::step]
         return cls(kinds, grid.resolution, grid.origin, points.astype(np.float64), normals.astype(np.float64), area)
@@ -187,15 +185,22 @@ def _known(kinds, resolution, origin, points, pose):  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def _spread(occupied, clear, near, kinds):  # type: ignore[no-untyped-def]
+def _sort(log_odds, clear, near, kinds):  # type: ignore[no-untyped-def]
     """Around occupied cells nothing is clearly free within ``clear`` cells, and all is surface within ``near``."""
     rows, columns = kinds.shape
+    for row in range(rows):
+        for column in range(columns):
+            value = log_odds[row, column]
+            kinds[row, column] = _CLEAR if value <= FREE else _UNKNOWN if abs(value) <= UNKNOWN else _OTHER
     side = int(clear + 1e-6)
-    for row, column in occupied:
-        for v in range(max(0, row - side), min(rows, row + side + 1)):
-            for u in range(max(0, column - side), min(columns, column + side + 1)):
-                square = (v - row) ** 2 + (u - column) ** 2
-                if square <= near * near + 1e-6:
-                    kinds[v, u] = _SURFACE
-                elif square <= clear * clear + 1e-6 and kinds[v, u] == _CLEAR:
-                    kinds[v, u] = _OTHER
+    for row in range(rows):
+        for column in range(columns):
+            if log_odds[row, column] <= 0.0:
+                continue
+            for v in range(max(0, row - side), min(rows, row + side + 1)):
+                for u in range(max(0, column - side), min(columns, column + side + 1)):
+                    square = (v - row) ** 2 + (u - column) ** 2
+                    if square <= near * near + 1e-6:
+                        kinds[v, u] = _SURFACE
+                    elif square <= clear * clear + 1e-6 and kinds[v, u] == _CLEAR:
+                        kinds[v, u] = _OTHER
