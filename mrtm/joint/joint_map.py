@@ -1,5 +1,6 @@
 """What somebody makes of all the edges they have heard of: a joint graph for every connected component."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -19,13 +20,13 @@ class Component:
         robots: ascending.
         graph: all their edges, and those added; without added ones the robot's own graph.
         added: what came to them: edges between robots, and alignments of maps, by their ids.
-        contradicted: those that sightings made and the graph doubted when it was made.
+        misplaced: pairs of them of which it doubted most that sightings made when it was made.
     """
 
     robots: tuple[str, ...]
     graph: JointGraph
     added: dict[EdgeId, GraphEdge] = field(default_factory=dict)
-    contradicted: frozenset[EdgeId] = frozenset()
+    misplaced: frozenset[frozenset[str]] = frozenset()
 
 
 class JointMap:
@@ -125,7 +126,7 @@ class JointMap:
             if component.robots == robots and component.added.keys() and mine:
                 try:
                     _exchange(component, mine)
-                    if _contradicted(component) <= component.contradicted:
+                    if _misplaced(component) <= component.misplaced:
                         continue
                 except GraphError:
                     pass  # perhaps on the way there only
@@ -137,7 +138,7 @@ class JointMap:
                 self._refuse(next(iter(mine.values())), error)
                 self._apart(robots)
             else:
-                component.contradicted = _contradicted(component)
+                component.misplaced = _misplaced(component)
                 self._component.update(dict.fromkeys(robots, component))
 
     def _refuse(self, edge: GraphEdge, error: GraphError) -> None:
@@ -213,13 +214,16 @@ def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
     component.added = added
 
 
-def _contradicted(component: Component) -> frozenset[EdgeId]:
-    """What sightings made and the graph doubts.
+def _misplaced(component: Component) -> frozenset[frozenset[str]]:
+    """Pairs of robots of which the graph doubts at least half of what sightings made.
 
-    They may have been judged otherwise since, and alignments from where robots seemed to be may hold these there.
+    These may have been judged otherwise since, and alignments from where the robots seemed to be may hold them there.
     """
-    added = component.added
-    return frozenset(i for i in component.graph.doubted() & added.keys() if added[i].kind in FUSED)
+    fused = [e for e in component.added.values() if e.kind in FUSED]
+    without_effect = component.graph.doubted()
+    known = Counter(frozenset(_ends(e)) for e in fused)
+    doubted = Counter(frozenset(_ends(e)) for e in fused if e.id in without_effect)
+    return frozenset(robots for robots, count in doubted.items() if 2 * count >= known[robots])
 
 
 def _ends(edge: GraphEdge) -> set[str]:
