@@ -11,6 +11,8 @@ from mrtm.joint.equations import FUSED
 from mrtm.joint.graph import GraphError, JointGraph
 from mrtm.joint.own_graph import own_graph, refusal
 
+MISPLACED = 4  # edges that sightings made between two robots, half of them doubted, for a component to be made anew
+
 
 @dataclass(slots=True)
 class Component:
@@ -215,7 +217,7 @@ def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
 
 
 def _misplaced(component: Component) -> frozenset[frozenset[str]]:
-    """Pairs of robots of which the graph doubts at least half of what sightings made.
+    """Pairs of robots of which the graph doubts at least half of what sightings made, and more than a stray edge.
 
     These may have been judged otherwise since, and alignments from where the robots seemed to be may hold them there.
     """
@@ -223,7 +225,7 @@ def _misplaced(component: Component) -> frozenset[frozenset[str]]:
     without_effect = component.graph.doubted()
     known = Counter(frozenset(_ends(e)) for e in fused)
     doubted = Counter(frozenset(_ends(e)) for e in fused if e.id in without_effect)
-    return frozenset(robots for robots, count in doubted.items() if 2 * count >= known[robots])
+    return frozenset(robots for robots, count in doubted.items() if 2 * count >= max(known[robots], MISPLACED))
 
 
 def _ends(edge: GraphEdge) -> set[str]:
