@@ -22,7 +22,7 @@ MARGIN = 0.10  # metres by which a beam must pass something to have seen through
 BACK = 0.3  # metres driven since the scan that a new one is compared with
 SPACING = 0.05  # metres between those that are kept for it
 LEAST = 3  # successive endpoints, that it is not a post between two beams
-MOST = 0.5  # part of a scan: if more of it seems to move, it is the pose that is wrong
+MOST = 0.3  # part of a scan: if more of it seems to move, it is the pose that is wrong
 
 
 @njit(cache=True, nogil=True)

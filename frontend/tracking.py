@@ -114,10 +114,14 @@ class Tracker:
                 step = mirrored
         if len(points.hits) >= MIN_POINTS and not _good(step):
             step = self._search(layers, points, se2.compose(self.pose, increment), increment, step)
-        standing = self.movers.standing(points, se2.between(self.pose, step.pose))
-        if standing is not points and _good(step):
-            prior, information = se2.compose(self.pose, increment), np.diag(1.0 / added)
-            step = self._match(layers, standing, step.pose, prior, information)
+        if _good(step) and not step.searched and not turned_over:
+            standing = self.movers.standing(points, se2.between(self.pose, step.pose))
+            if standing is not points:
+                prior, information = se2.compose(self.pose, increment), np.diag(1.0 / added)
+                step = self._match(layers, standing, step.pose, prior, information)
+        else:
+            # Seen from a wrong place the walls seem to move; without them it would seem to be the right one.
+            self.movers.start(points)
         step.reversed, step.forward = turned_over, bool(self._sign[0] > 0.0)
         self.pose = step.pose
         if self.doubt == 0.0:
