@@ -21,7 +21,7 @@ BINS = 360  # of bearing, a degree each
 MARGIN = 0.10  # metres by which a beam must pass something to have seen through it
 BACK = 0.3  # metres driven since the scan that a new one is compared with
 SPACING = 0.05  # metres between those that are kept for it
-LEAST = 3  # successive endpoints, that it is not a post between two beams
+LEAST = 4  # successive endpoints, that it is not a post between two beams
 MOST = 0.3  # part of a scan: if more of it seems to move, it is the pose that is wrong
 
 

@@ -41,7 +41,7 @@ class Step:
         known: fraction of all endpoints that lie in known space.
         log_likelihood: of the scan, relative to that of a perfect fit.
         hessian: (3, 3) information of the scan on the pose, map coordinates.
-        points: what of the scan stands still; the rest was not matched and is not for the map.
+        points: what of the scan stands still; ``pose`` and ``hessian`` are of that alone, and no more is for the map.
         searched: 0 if the plain match was good; 1 or 2 for a search around or far around the expected pose.
         reversed: odometry was found to have changed its sign,
         forward: and whether it has the right one now.
@@ -118,9 +118,10 @@ class Tracker:
             standing = self.movers.standing(points, se2.between(self.pose, step.pose))
             if standing is not points:
                 prior, information = se2.compose(self.pose, increment), np.diag(1.0 / added)
-                step = self._match(layers, standing, step.pose, prior, information)
+                again = self._match(layers, standing, step.pose, prior, information)
+                # Whether this is the place the whole scan says: on a wrong path it is the walls that seem to move.
+                step.pose, step.hessian, step.points = again.pose, again.hessian, standing
         else:
-            # Seen from a wrong place the walls seem to move; without them it would seem to be the right one.
             self.movers.start(points)
         step.reversed, step.forward = turned_over, bool(self._sign[0] > 0.0)
         self.pose = step.pose
