@@ -1,12 +1,10 @@
-"""What moves is told from what stands still, and nothing is where the robot only turns, or nothing moves."""
+"""What moves is told from what stands still."""
 
 import numpy as np
 import numpy.typing as npt
 
 from frontend import se2
-from frontend.local_slam import LocalSlam
 from frontend.moving import BACK, Movers
-from frontend.parameters import FilterParameters
 from frontend.points import Points, points_of
 from frontend.records import FloatArray
 from tests.frontend.simulated import CORRIDOR, drive, scan_of
@@ -32,7 +30,7 @@ def led(steps: int, speed: float, distance: float) -> tuple[FloatArray, list[Poi
 
 
 def test_a_robot_ahead_is_left_out_and_the_walls_stay() -> None:
-    for speed, distance in ((STEP, 2.5), (-STEP, 9.0), (0.0, 9.0)):
+    for speed, distance in ((STEP, 2.5), (-STEP, 9.0), (0.0, 5.0)):
         poses, points, bodies = led(24, speed, distance)
         movers = Movers()
         movers.start(points[0])
@@ -60,7 +58,7 @@ def test_where_nothing_moves_nearly_everything_stays() -> None:
 
 
 def test_a_path_that_begins_anew_has_nothing_to_compare_with() -> None:
-    poses, points, bodies = led(8, STEP, 2.5)
+    poses, points, _ = led(8, STEP, 2.5)
     movers = Movers()
     movers.start(points[0])
     last = points[0]
@@ -71,14 +69,3 @@ def test_a_path_that_begins_anew_has_nothing_to_compare_with() -> None:
     assert movers.standing(points[6], se2.between(poses[5], poses[6])) is not points[6]
     movers.start(points[6])
     assert movers.standing(points[7], se2.between(poses[6], poses[7])) is points[7]
-
-
-def test_a_robot_that_drives_ahead_does_not_hold_the_map_back() -> None:
-    poses, points, _ = led(60, STEP, 2.5)
-    slam = LocalSlam(FilterParameters(particles=12), seed=1)
-    slam.begin(points[0], np.zeros((12, 3)))
-    for scan in points[1:]:
-        slam.add(scan, np.array([STEP, 0.0, 0.0]))
-    visit = slam.finish()
-    # The corridor is bare: odometry, which is right, is all that tells the way.
-    assert abs(visit.poses[-1, 0] - poses[-1, 0]) < 0.08
