@@ -74,7 +74,7 @@ class LocalSlam:
         self._base, self._mapping = known, mapping
         if not again:
             self._entrance = poses[0].copy()
-        self.filter.start(poses, known)
+        self.filter.start(poses, known, points)
         self._points, self._increments = [points], [np.zeros(3)]
         self._offsets, self._keys, self._steps, self._resampled = [np.zeros(3)], [0], 0, 0
         self._localised = np.empty((0, 3))
@@ -98,6 +98,7 @@ class LocalSlam:
         """Take the next scan, ``increment`` (3,) of odometry after the last one."""
         p = self.parameters
         step = self.filter.track(points, increment)
+        points = step.points
         offset = se2.between(self.filter.poses[self.filter.leader], step.pose)
         # While it is open which way the robot drives, drawing waits a little.
         patience = PATIENCE if self.filter.doubt > 0.5 * REVERSED else 1.0

@@ -116,13 +116,14 @@ class ParticleFilter:
         self.leader = 0
         self._tracker = Tracker(parameters)
 
-    def start(self, poses: FloatArray, known: Maps | None = None) -> None:
+    def start(self, poses: FloatArray, known: Maps | None = None, scan: Points | None = None) -> None:
         """Begin a local map: M1 and M7a with ``poses`` all zero and nothing known; M3's re-entry with the poses drawn
         from the projected covariance and the map that the vertex has already (a stack of one).
 
         Args:
             poses: (particles, 3) local_T_robot.
             known: what all particles know already.
+            scan: taken there; where it was tracked last, the scans before still tell what moves.
         """
         count = self.parameters.particles
         if known is None:
@@ -135,6 +136,8 @@ class ParticleFilter:
         self._history = [(self.poses.copy(), np.arange(count))]
         self.leader = 0
         self._tracker.rest(self.poses[0].copy())
+        if scan is not None:
+            self._tracker.movers.start(scan)
 
     @property
     def weights(self) -> FloatArray:

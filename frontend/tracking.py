@@ -11,6 +11,7 @@ import numpy as np
 from frontend import motion, se2
 from frontend.grid import Layers
 from frontend.matching import match, search
+from frontend.moving import Movers
 from frontend.parameters import FilterParameters
 from frontend.points import Points
 from frontend.records import FloatArray
@@ -40,6 +41,7 @@ class Step:
         known: fraction of all endpoints that lie in known space.
         log_likelihood: of the scan, relative to that of a perfect fit.
         hessian: (3, 3) information of the scan on the pose, map coordinates.
+        points: what of the scan stands still; ``pose`` and ``hessian`` are of that alone, and no more is for the map.
         searched: 0 if the plain match was good; 1 or 2 for a search around or far around the expected pose.
         reversed: odometry was found to have changed its sign,
         forward: and whether it has the right one now.
@@ -50,6 +52,7 @@ class Step:
     known: float
     log_likelihood: float
     hessian: FloatArray
+    points: Points
     searched: int = 0
     reversed: bool = False
     forward: bool = True
@@ -63,12 +66,14 @@ class Tracker:
         motion: (3,) what odometry says of the way since the tracker was last told where it is,
         variances: (3,) and of that the variances.
         doubt: log-likelihood by which the opposite sign explains the last scans better.
+        movers: what has moved since the scans before.
     """
 
     def __init__(self, parameters: FilterParameters) -> None:
         self._parameters = parameters
         self._sign = np.ones(3)
         self._unsure = 0.0  # metres driven under the opposite sign since a scan last spoke for it
+        self.movers = Movers()
         self.rest(np.zeros(3))
 
     def rest(self, pose: FloatArray) -> None:
@@ -109,6 +114,15 @@ class Tracker:
                 step = mirrored
         if len(points.hits) >= MIN_POINTS and not _good(step):
             step = self._search(layers, points, se2.compose(self.pose, increment), increment, step)
+        if _good(step) and not step.searched and not turned_over:
+            standing = self.movers.standing(points, se2.between(self.pose, step.pose))
+            if standing is not points:
+                prior, information = se2.compose(self.pose, increment), np.diag(1.0 / added)
+                again = self._match(layers, standing, step.pose, prior, information)
+                # Whether this is the place the whole scan says: on a wrong path it is the walls that seem to move.
+                step.pose, step.hessian, step.points = again.pose, again.hessian, standing
+        else:
+            self.movers.start(points)
         step.reversed, step.forward = turned_over, bool(self._sign[0] > 0.0)
         self.pose = step.pose
         if self.doubt == 0.0:
@@ -135,7 +149,7 @@ class Tracker:
         )
         known = near + free
         start[2] = se2.wrap(start[2])
-        return Step(start, fit / max(1, known), known / max(1, len(points.hits)), log_likelihood, hessian)
+        return Step(start, fit / max(1, known), known / max(1, len(points.hits)), log_likelihood, hessian, points)
 
     def _search(self, layers: Layers, points: Points, prior: FloatArray, increment: FloatArray, best: Step) -> Step:
         """The match is poor: odometry may be wrong. Look around, and if that does not help, far around.

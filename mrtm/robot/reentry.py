@@ -84,6 +84,7 @@ class Trial:
         knowns: for each scan, the fraction of the endpoints in known space.
         distance: metres driven so far; a turn counts as if driven on an arc of TURN_RADIUS.
         next_check: distance at which the next attempt to confirm it is due.
+        reversed: odometry seemed to change its sign.
     """
 
     candidate: Candidate
@@ -94,11 +95,13 @@ class Trial:
     knowns: list[float] = field(default_factory=list)
     distance: float = 0.0
     next_check: float = 0.0
+    reversed: bool = False
 
     def add(self, step: Step, increment: FloatArray) -> None:
         """Take note of one more scan."""
         self.fits.append(step.fit)
         self.knowns.append(step.known)
+        self.reversed |= step.reversed
         self.distance += float(np.hypot(increment[0], increment[1])) + TURN_RADIUS * abs(float(increment[2]))
 
     def verdict(self, slam: LocalSlam, p: TopologyParameters, leaving: bool) -> tuple[bool | None, str]:
@@ -108,6 +111,9 @@ class Trial:
             slam: localising in the old map. Where the stretch so far fits another place, it starts again from there.
             leaving: the robot is about to leave the vertex: decide now.
         """
+        if self.reversed:
+            # A wrong place is the likelier reason: from there on the old map would hold the robot to driving back.
+            return False, "odometry would have to lie"
         if len(self.fits) < p.trial_scans:
             return (False, "left before it was sure") if leaving else (None, "")
         # The worse of the whole stretch and its end: a robot that drifts off the old map fits well at first.

@@ -101,6 +101,7 @@ class Robot:
     def _advance(self, points: Points, increment: FloatArray) -> None:
         with self._stages("filter"):
             step = self._slam.add(points, increment)  # M3
+        points = step.points
         if step.searched:
             self._tell("searched wider", level=step.searched, fit=step.fit, known=step.known)
         if step.reversed:

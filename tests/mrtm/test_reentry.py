@@ -15,6 +15,7 @@ from frontend import se2
 from frontend.grid import Maps
 from frontend.local_slam import LocalSlam
 from frontend.parameters import FilterParameters
+from frontend.points import Points
 from frontend.records import FloatArray
 from frontend.tracking import Step
 from mrtm.config import TopologyParameters
@@ -24,6 +25,7 @@ from mrtm.robot.reentry import Candidate, Trial, candidates
 from mrtm.robot.topology import Vertex
 
 HALF = 5.0
+NOTHING = Points(np.empty((0, 4), np.float32), np.empty((0, 2), np.float32), np.zeros(2))
 SURE = 1e-6 * np.eye(3)
 P = TopologyParameters(
     trial_scans=4, trial_distance=2.0, trial_fit=0.7, trial_known=0.55, trial_spread=0.15, trial_lead=0.05
@@ -154,7 +156,7 @@ class Slam:
         self.start.append(poses[0])
 
     def add(self, points: None, increment: FloatArray) -> Step:
-        return Step(np.zeros(3), 0.9, 0.9, -10.0, np.eye(3))
+        return Step(np.zeros(3), 0.9, 0.9, -10.0, np.eye(3), NOTHING)
 
 
 def trial(fits: list[float], knowns: list[float] | float = 0.9, metres: float = 0.3) -> Trial:
@@ -162,7 +164,7 @@ def trial(fits: list[float], knowns: list[float] | float = 0.9, metres: float = 
     projected = UncertainPose(gtsam.Pose2(1.0, 0.0, 0.0), np.diag([0.1, 0.1, 0.05]) ** 2)
     result = Trial(Candidate(vertex, projected), UncertainPose(gtsam.Pose2(), SURE), 0, resume=False)
     for fit, known in zip(fits, knowns if isinstance(knowns, list) else [knowns] * len(fits), strict=True):
-        result.add(Step(np.zeros(3), fit, known, -10.0, np.eye(3)), np.array([metres, 0.0, 0.0]))
+        result.add(Step(np.zeros(3), fit, known, -10.0, np.eye(3), NOTHING), np.array([metres, 0.0, 0.0]))
     return result
 
 
@@ -190,7 +192,7 @@ def test_a_trial_adds_up_what_it_saw() -> None:
     assert (t.fits, t.knowns) == ([0.9, 0.8], [0.7, 0.6])
     assert t.distance == pytest.approx(1.0)
     before = t.distance
-    t.add(Step(np.zeros(3), 0.9, 0.9, -10.0, np.eye(3)), np.array([0.0, 0.0, -1.0]))
+    t.add(Step(np.zeros(3), 0.9, 0.9, -10.0, np.eye(3), NOTHING), np.array([0.0, 0.0, -1.0]))
     assert t.distance > before  # turning on the spot shows a place, too
 
 
@@ -222,7 +224,7 @@ def waits_until_the_limit(t: Trial, sigma: float = 0.01) -> str:
     assert verdict(t, sigma, leaving=True)[0] is False
     fit, known, driven = t.fits[-1], t.knowns[-1], 0.0
     while (outcome := verdict(t, sigma))[0] is None:
-        t.add(Step(np.zeros(3), fit, known, -10.0, np.eye(3)), np.array([0.4, 0.0, 0.0]))
+        t.add(Step(np.zeros(3), fit, known, -10.0, np.eye(3), NOTHING), np.array([0.4, 0.0, 0.0]))
         driven += 0.4
         assert driven < 10.0 * P.trial_distance, "never comes to a verdict"
     assert driven > 0.0
@@ -355,3 +357,9 @@ def test_the_innovation_of_honest_estimates_is_chi2_with_three_degrees_of_freedo
         assert a.pose.compose(gtsam.Pose2.Expmap(offset)).equals(b.pose, 1e-9)
         values.append(chi2)
     assert kstest(values, chi2_distribution(3).cdf).pvalue > 1e-3
+
+
+def test_a_place_where_odometry_would_have_to_lie_is_refused() -> None:
+    t = trial([0.95] * 30)
+    t.add(Step(np.zeros(3), 0.95, 0.9, -10.0, np.eye(3), NOTHING, reversed=True, forward=False), np.zeros(3))
+    assert verdict(t, 0.01) == (False, "odometry would have to lie")
