@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import gtsam
 
 from factors import Edge, EdgeId, GraphEdge, VertexId
+from mrtm.joint.doubts import GROWN
 from mrtm.joint.equations import FUSED
 from mrtm.joint.graph import GraphError, JointGraph
 from mrtm.joint.own_graph import own_graph, refusal
@@ -22,13 +23,13 @@ class Component:
         robots: ascending.
         graph: all their edges, and those added; without added ones the robot's own graph.
         added: what came to them: edges between robots, and alignments of maps, by their ids.
-        misplaced: pairs of them of which it doubted most that sightings made when it was made.
+        misplaced: pairs of them of which the graph doubted most that sightings made, when it was made.
     """
 
     robots: tuple[str, ...]
     graph: JointGraph
     added: dict[EdgeId, GraphEdge] = field(default_factory=dict)
-    misplaced: frozenset[frozenset[str]] = frozenset()
+    misplaced: int = 0
 
 
 class JointMap:
@@ -128,7 +129,7 @@ class JointMap:
             if component.robots == robots and component.added.keys() and mine:
                 try:
                     _exchange(component, mine)
-                    if _misplaced(component) <= component.misplaced:
+                    if _misplaced(component) <= GROWN * component.misplaced:
                         continue
                 except GraphError:
                     pass  # perhaps on the way there only
@@ -216,7 +217,7 @@ def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
     component.added = added
 
 
-def _misplaced(component: Component) -> frozenset[frozenset[str]]:
+def _misplaced(component: Component) -> int:
     """Pairs of robots of which the graph doubts at least half of what sightings made, and more than a stray edge.
 
     These may have been judged otherwise since, and alignments from where the robots seemed to be may hold them there.
@@ -225,7 +226,7 @@ def _misplaced(component: Component) -> frozenset[frozenset[str]]:
     without_effect = component.graph.doubted()
     known = Counter(frozenset(_ends(e)) for e in fused)
     doubted = Counter(frozenset(_ends(e)) for e in fused if e.id in without_effect)
-    return frozenset(robots for robots, count in doubted.items() if 2 * count >= max(known[robots], MISPLACED))
+    return sum(2 * count >= max(known[robots], MISPLACED) for robots, count in doubted.items())
 
 
 def _ends(edge: GraphEdge) -> set[str]:
