@@ -34,9 +34,9 @@ class GraphError(ValueError):
 class JointGraph:
     """One connected component, solved: after every ``update`` the estimate is the optimum.
 
-    To 2e-5 m and rad, that is. Of more than a thousand vertices those that have turned by less than 5 mrad are not
+    To 2e-5 m and rad, that is. Of more than a thousand vertices those that have turned by less than 2 mrad are not
     linearised anew, and of those that have turned further each update takes a portion, so that none makes others wait.
-    The estimate stays 1 to 3 cm from the optimum; where a loop turns thousands of vertices it may be more,
+    The estimate stays 1 to 2 cm from the optimum; where a loop turns thousands of vertices it may be more,
     for a few dozen updates (M3500: 6 cm after the worst loop). ``optimize_fully`` gets the last digit.
 
     The root's pose is fixed by a prior (M1); the frame in which it has that pose is the joint frame. Every other
