@@ -48,8 +48,8 @@ NEARER = 0.5  # of the chi2 that a doubted edge had when it was judged, for it t
 GROWN = 1.5
 """Times as many must agree for another look at a set of doubted edges: it takes the whole graph."""
 
-TRIES = 2
-"""Sets of doubted edges that a change finds not to fit, until it looks for no more."""
+MORE = 1.02
+"""Times as many edges the graph must have as when a set did not fit, for the next to be tried."""
 
 SLIP = 100.0
 """chi2 by which edges that agree may strain those that cannot be false, beside their own noise: the robot may have
@@ -62,7 +62,7 @@ class Doubts:
     def __init__(self) -> None:
         self._agreeing: defaultdict[EdgeId, set[EdgeId]] = defaultdict(set)
         self._failed: dict[EdgeId, int] = {}  # size of the last set of doubted edges with it that could not come in
-        self._tries = 0  # sets that could not come in after this change
+        self._tried = 0  # edges that the graph had when a set last could not come in
         self._next = 0  # place among all edges of the next believed one to be checked
 
     def settle(self, equations: Equations, new: Collection[EdgeId]) -> None:
@@ -72,7 +72,6 @@ class Doubts:
             new: edges just added, which are doubted so far.
         """
         suspects, fresh = self._suspects(equations), set(new)
-        self._tries = 0
         went_before: set[EdgeId] = set()
         unseen = 1  # of the doubted ones, to be looked at before the graph is at rest
         for _ in range(ROUNDS + len(new)):
@@ -110,7 +109,7 @@ class Doubts:
     def _let_in_together(self, equations: Equations, new: Iterable[EdgeId]) -> list[EdgeId]:
         """The first set of edges around a new one that agree with each other and with what cannot be false."""
         for i in new:
-            if self._tries == TRIES:
+            if len(equations.edges) < MORE * self._tried:
                 break
             others = [j for j in islice(reversed(equations.doubted), LOOKED) if j != i]
             for j in agreeing(equations, i, others, _agree):
@@ -122,7 +121,7 @@ class Doubts:
             if (went := _contradicted(equations, members)) is not None:
                 return [*members, *went]
             self._failed.update(dict.fromkeys(members, len(members)))
-            self._tries += 1
+            self._tried = len(equations.edges)
         return []
 
     def _put_out(self, equations: Equations, suspects: Iterable[EdgeId]) -> list[EdgeId]:

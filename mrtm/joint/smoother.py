@@ -47,7 +47,7 @@ _PATIENCE = 3  # updates before the next portion, of those that only add vertice
 # Radians: where nothing has turned so far, lengths are right to 5e-5 of themselves, and one step leads to the optimum.
 _FAR = 0.01
 
-_MAX_STEPS = 30
+_MAX_STEPS = 15
 _NEVER = 2**31 - 1  # updates
 
 # Factors in all the eliminations that are kept for further questions, seen from one pose each: about 10 kB a factor.
