@@ -14,6 +14,9 @@ from mrtm.joint.own_graph import own_graph, refusal
 
 MISPLACED = 4  # edges that sightings made between two robots, half of them doubted, for a component to be made anew
 
+SLIPPED = 0.05
+"""Of the pairs of robots: so few of them are misplaced because a robot's own map is wrong, and will be so anew."""
+
 
 @dataclass(slots=True)
 class Component:
@@ -226,7 +229,8 @@ def _misplaced(component: Component) -> int:
     without_effect = component.graph.doubted()
     known = Counter(frozenset(_ends(e)) for e in fused)
     doubted = Counter(frozenset(_ends(e)) for e in fused if e.id in without_effect)
-    return sum(2 * count >= max(known[robots], MISPLACED) for robots, count in doubted.items())
+    count = sum(2 * count >= max(known[robots], MISPLACED) for robots, count in doubted.items())
+    return count if count > SLIPPED * len(known) else 0
 
 
 def _ends(edge: GraphEdge) -> set[str]:
