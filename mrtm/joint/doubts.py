@@ -69,15 +69,15 @@ class Doubts:
         """Bring a graph that has changed to rest: let in, and put out, until nothing is due.
 
         Args:
-            new: edges just added, which are doubted so far.
+            new: edges just added, which are doubted so far; whether one is among them is asked often.
         """
-        suspects, fresh = self._suspects(equations), set(new)
+        suspects = self._suspects(equations)
         went_before: set[EdgeId] = set()
         unseen = 1  # of the doubted ones, to be looked at before the graph is at rest
         for _ in range(ROUNDS + len(new)):
             if unseen <= 0:
                 return
-            again = list(islice((i for i in equations.doubted if i not in fresh), CHECKED))
+            again = list(islice((i for i in equations.doubted if i not in new), CHECKED))
             for i in again:  # to the end of the queue
                 equations.doubted[i] = equations.doubted.pop(i)
             unseen -= CHECKED

@@ -159,7 +159,10 @@ class JointGraph:
 
     def relatives(self, pairs: Sequence[tuple[VertexId, VertexId]]) -> list[UncertainPose]:
         """``relative`` of many pairs: about one elimination of the graph for all of them."""
-        return self._equations().relatives([(a, b) for a, b in pairs if self._key(a) >= 0 and self._key(b) >= 0])
+        for pair in pairs:
+            for end in pair:
+                self._key(end)
+        return self._equations().relatives(pairs)
 
     def innovation(self, edge: GraphEdge) -> float:
         """How far an edge that is not in the graph is from what the graph expects: chi2, a degree of freedom a number.
@@ -342,7 +345,7 @@ class JointGraph:
             self._smoother.update(settled | first, values, out)
         self._doubted |= late
         if out or any(edge.kind not in CERTAIN for edge in judged):
-            self._doubts.settle(self._equations(), list(late))
+            self._doubts.settle(self._equations(), late)
 
     def _strained(
         self, settled: Iterable[EdgeId], judged: list[GraphEdge], made: dict[VertexId, gtsam.Pose2], taken: bool

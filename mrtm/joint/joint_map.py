@@ -229,8 +229,8 @@ def _misplaced(component: Component) -> int:
     without_effect = component.graph.doubted()
     known = Counter(frozenset(_ends(e)) for e in fused)
     doubted = Counter(frozenset(_ends(e)) for e in fused if e.id in without_effect)
-    count = sum(2 * count >= max(known[robots], MISPLACED) for robots, count in doubted.items())
-    return count if count > SLIPPED * len(known) else 0
+    pairs = sum(2 * count >= max(known[robots], MISPLACED) for robots, count in doubted.items())
+    return pairs if pairs > SLIPPED * len(known) else 0
 
 
 def _ends(edge: GraphEdge) -> set[str]:

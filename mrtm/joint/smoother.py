@@ -8,7 +8,7 @@ is such a one). From then on QR, which solves those too and takes up to twice as
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -19,7 +19,6 @@ from mrtm.joint.kernels import Kernels
 from mrtm.joint.relinearization import TURN, portion
 
 FloatArray = npt.NDArray[np.float64]
-T = TypeVar("T")
 
 
 class _Tolerance(NamedTuple):
@@ -82,7 +81,6 @@ class Smoother:
         self._factorization = "CHOLESKY"
         self._values: gtsam.Values | None = None
         self._seen_from: dict[int, gtsam.ISAM2] = {}
-        self._settled = False  # nothing has moved since all that had moved was linearised anew
         self._waited = 0  # updates since one that linearised a portion anew
         self._behind = False  # whether that left some for the next
         self._start(factors, values)
@@ -118,8 +116,7 @@ class Smoother:
                 self._solve(lambda: self._insert({}, gtsam.Values(), (), None))
             return
         for _ in range(_MAX_STEPS):
-            if self._settled or np.abs(self._isam.getDelta().vector()).max() < self._tolerance.shift:
-                self._settled = True
+            if np.abs(self._isam.getDelta().vector()).max() < self._tolerance.shift:
                 return
             self._solve(lambda: self._insert({}, gtsam.Values(), (), None))
         self.refine()
@@ -237,10 +234,10 @@ class Smoother:
         self._kernels = Kernels()
         self._insert(dict(factors), rest, (), 0)
 
-    def _solve(self, step: Callable[[], T]) -> T:
-        """What ``step`` returns; where Cholesky gives up in it, all is begun anew with QR and it is done again."""
+    def _solve(self, step: Callable[[], None]) -> None:
+        """Do a ``step``; where Cholesky gives up in it, all is begun anew with QR and it is done again."""
         try:
-            return step()
+            step()
         except RuntimeError:
             self._fall_back()
             values = self.start()
@@ -248,7 +245,7 @@ class Smoother:
             for key in {*values.keys()} - held:
                 values.erase(key)
             self._build(self._factors, values)
-            return step()
+            step()
 
     def _fall_back(self) -> None:
         """From Cholesky to QR; if that is what has failed, on with its error."""
@@ -262,8 +259,8 @@ class Smoother:
         values: gtsam.Values,
         remove: Collection[EdgeId],
         most: int | None,
-    ) -> int:
-        """One update of iSAM2; 0 if no variable had to be linearised anew, as at ``most`` of a large graph may be."""
+    ) -> None:
+        """One update of iSAM2; all that has moved is linearised anew, of a large graph so many variables at most."""
         coarse = self._tolerance is _COARSE
         again: dict[EdgeId, gtsam.NoiseModelFactor] = {}
         solved = dict(add)
@@ -286,7 +283,6 @@ class Smoother:
             top = gtsam.KeyGroupMap()
             top.insert2(max(next(iter(add.values())).keys()), 1)
             change.constrainedKeys = top
-        self._settled = False
         result = self._isam.update(graph, values, change)
         for edge_id in remove:
             del self._slots[edge_id]
@@ -297,7 +293,6 @@ class Smoother:
         self._size += values.size() - result.getUnusedKeys().size()
         self._values = None
         self._seen_from = {}
-        return int(result.getVariablesRelinearized())
 
     def _estimate_of(self, keys: list[int], new: gtsam.Values) -> gtsam.Values:
         """The estimate of some keys, or what is given of them if they are new."""
