@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -11,19 +11,17 @@ from factors.errors import FactorError
 from factors.noise import FloatArray, UncertainPose, check_covariance, check_pose
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class VertexId:
+class VertexId(NamedTuple):
     """A vertex: the robot that made it and its running number, from 0. Reads "red:3"."""
 
     robot: str
-    index: int
+    number: int
 
     def __str__(self) -> str:
-        return f"{self.robot}:{self.index}"
+        return f"{self.robot}:{self.number}"
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class EdgeId:
+class EdgeId(NamedTuple):
     """An edge: the robot that made it and its running number, from 0. Reads "red#7"."""
 
     robot: str
@@ -135,8 +133,8 @@ class Edge:
             "id": [self.id.robot, self.id.number],
             "version": self.version,
             "kind": str(self.kind),
-            "tail": [self.tail.robot, self.tail.index],
-            "head": [self.head.robot, self.head.index],
+            "tail": [self.tail.robot, self.tail.number],
+            "head": [self.head.robot, self.head.number],
             "measurement": [pose.x(), pose.y(), pose.theta()],
             "covariance": self.covariance.tolist(),
         }

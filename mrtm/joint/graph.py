@@ -189,7 +189,7 @@ class JointGraph:
         poses = self.estimates()
         return {
             "root": _coordinates(self._root_pose),
-            "vertices": [[v.robot, v.index, *_coordinates(poses[v])] for v in self._keys],
+            "vertices": [[v.robot, v.number, *_coordinates(poses[v])] for v in self._keys],
             "edges": [edge.to_dict() for edge in self._edges.values()],
             "doubted": [[i.robot, i.number, chi2] for i, chi2 in self._doubted.items()],
         }
@@ -299,7 +299,7 @@ class JointGraph:
 
     def _absorb(self, other: "JointGraph", bridge: GraphEdge, edges: list[GraphEdge]) -> None:
         """Stage the union of two components, check it, and solve it."""
-        for name in sorted(map(str, (other._keys.keys() & self._keys) | (other._edges.keys() & self._edges))):
+        for name in sorted(map(str, (*(other._keys.keys() & self._keys), *(other._edges.keys() & self._edges)))):
             raise GraphError(f"{name} is in both components: they cannot be merged")
         if bridge.estimate is None or not _joins(bridge, self._keys, other._keys):
             raise GraphError(f"{bridge} cannot join the component of {other.root} to that of {self.root}")
@@ -346,6 +346,7 @@ class JointGraph:
         self._doubted |= late
         if out or any(edge.kind not in CERTAIN for edge in judged):
             self._doubts.settle(self._equations(), late)
+        self._smoother.come_to_rest()
 
     def _strained(
         self, settled: Iterable[EdgeId], judged: list[GraphEdge], made: dict[VertexId, gtsam.Pose2], taken: bool

@@ -1,4 +1,4 @@
-"""The solver of the joint graph: iSAM2, always settled at the optimum. No other module touches ISAM2.
+"""The solver of the joint graph: iSAM2, settled at the optimum. No other module touches ISAM2.
 
 Gauss-Newton, not Dogleg: on the M3500 graph, edge by edge, it reaches the same optimum in a quarter of the
 time; where it does not settle, Levenberg-Marquardt takes over. Cholesky, until it gives up ("indeterminate"): it does
@@ -91,14 +91,11 @@ class Smoother:
         values: gtsam.Values,
         remove: Collection[EdgeId],
     ) -> None:
-        """Take factors out, put others in, with ``values`` for the new keys, and settle at the optimum.
+        """Take factors out, put others in, with ``values`` for the new keys, and go one step to the new optimum.
 
         The new keys start where the factors that connect them have them.
 
         An id may be in both: its factor is exchanged. A key that is left without a factor is gone.
-
-        Of a graph of more than a thousand keys the estimate may stay a centimetre from the optimum, and further right
-        after a large loop: to linearise anew what that has turned is the work of the next updates (``refine``).
         """
         still = len(add) == values.size() and not remove  # each new key is where its only factor has it
         due = self._behind or self._waited >= (_PATIENCE if still else 2 * _PATIENCE)
@@ -106,7 +103,16 @@ class Smoother:
         self._solve(lambda: self._insert(add, values, remove, _PORTION if due else 0))
         if self._tolerance is not _tolerance(self._size):
             self._start(self._factors, self.values())
-        if not still and (self._tolerance is _EXACT or len(add) > _PORTION):
+        if self._tolerance is _COARSE and not still and len(add) > _PORTION:
+            self.settle()
+
+    def come_to_rest(self) -> None:
+        """Go all the way to the optimum.
+
+        Of a graph of more than a thousand keys the estimate may stay a centimetre from it, and further right after a
+        large loop: to linearise anew what that has turned is the work of the next updates (``refine``).
+        """
+        if self._tolerance is _EXACT:
             self.settle()
 
     def settle(self) -> None:

@@ -101,7 +101,7 @@ def run_record(result: RunResult) -> dict[str, Any]:
             for robot, trajectory in result.trajectories.items()
             if len(trajectory.times)
         },
-        "components": [[[v.robot, v.index] for v in component] for component in components],
+        "components": [[[v.robot, v.number] for v in component] for component in components],
         "vertices": [_vertex_record(result, vertex, number) for vertex, number in component_of.items()],
         "edges": [
             fate.edge.to_dict() | {"fate": fate.fate, "reason": fate.reason, "chi2": fate.chi2} for fate in result.edges
@@ -120,7 +120,7 @@ def _vertex_record(result: RunResult, vertex: VertexId, component: int) -> dict[
     if local_map is not None and len(local_map.times):
         first = {"time": local_map.times[0], "pose": local_map.poses[0]}  # local_T_robot
     return {
-        "id": [vertex.robot, vertex.index],
+        "id": [vertex.robot, vertex.number],
         "component": component,
         "pose": _xytheta(result.vertex_poses[vertex]),
         "covariance": result.vertex_covariances.get(vertex),

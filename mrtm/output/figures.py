@@ -108,9 +108,9 @@ def _draw_vertices(
     diameter = 1.9 * size
     axes.scatter(points[:, 0], points[:, 1], s=diameter**2, c=faces, edgecolors="white", linewidths=1.4, zorder=4)
     for vertex, (x, y) in zip(poses, points, strict=True):
-        digits = len(str(vertex.index))
+        digits = len(str(vertex.number))
         axes.text(
-            x, y, str(vertex.index), fontsize=size * (1.0 if digits < 3 else 0.75), color="white",
+            x, y, str(vertex.number), fontsize=size * (1.0 if digits < 3 else 0.75), color="white",
             fontweight="bold", ha="center", va="center_baseline", zorder=5,
         )  # fmt: skip
 

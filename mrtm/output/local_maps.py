@@ -14,7 +14,7 @@ UNIT = 0.05
 
 def local_map_name(vertex: VertexId) -> str:
     """The name of a vertex's file."""
-    return f"{vertex.robot}-{vertex.index}.npz"
+    return f"{vertex.robot}-{vertex.number}.npz"
 
 
 def write_local_map(path: Path, local_map: LocalMap) -> None:

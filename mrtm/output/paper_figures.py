@@ -108,7 +108,7 @@ def draw_same_place(result: RunResult, component: list[VertexId], path: Path) ->
     one, other = (colours[v.robot] for v in pair)
     if one == other:
         other = next(c for c in robot_colours(["blue", "red"]).values() if c != one)
-    panels = [Panel(f"{v.robot}, vertex {v.index}", view, paint(_maps(result, [v]), view)) for v in pair]
+    panels = [Panel(f"{v.robot}, vertex {v.number}", view, paint(_maps(result, [v]), view)) for v in pair]
     both = _tinted([(_maps(result, [v]), colour) for v, colour in zip(pair, (one, other), strict=True)], view)
     panels.append(Panel("both, at the joint estimate", view, both))
     draw_sheet("two local maps of the same place", [panels], path)
@@ -207,7 +207,7 @@ def _draw_graph(axes: Axes, result: RunResult, component: list[VertexId], view: 
     x, y = np.array(list(places.values())).T
     axes.scatter(x, y, s=(1.8 * size) ** 2, c=faces, edgecolors="white", zorder=4)
     for vertex, (u, v) in places.items():
-        axes.text(u, v, str(vertex.index), fontsize=size, color="white", ha="center", va="center_baseline", zorder=5)
+        axes.text(u, v, str(vertex.number), fontsize=size, color="white", ha="center", va="center_baseline", zorder=5)
 
 
 def _tinted(layers: Sequence[tuple[Maps, str]], view: View) -> Pixels:

@@ -73,7 +73,7 @@ def check_real(value: Any, limit: float, what: str, field: str) -> None:
 def check_vertex(vertex: VertexId, what: str, field: str) -> None:
     """Refuse a vertex whose robot or index does not check."""
     check_name(vertex.robot, what, field)
-    check_whole(vertex.index, what, field)
+    check_whole(vertex.number, what, field)
 
 
 def check_position(pose: gtsam.Pose2, what: str, field: str) -> None:

@@ -123,7 +123,7 @@ def _record(row: "_Row") -> Record:
 
 def _pack_vertex(vertex: VertexId, robot: str) -> int | list[Any]:
     """Its index alone if it is the writer's own."""
-    return vertex.index if vertex.robot == robot else [vertex.robot, vertex.index]
+    return vertex.number if vertex.robot == robot else [vertex.robot, vertex.number]
 
 
 def _pack_pose(pose: gtsam.Pose2, covariance: FloatArray) -> bytes:

@@ -218,7 +218,7 @@ def _run(robot: Robot, story: _Story, stages: Stages) -> MemberRun:
     for vertex in robot.topology.vertices:
         scans = np.array(vertex.scans, np.int64)
         poses[scans] = np.array(vertex.poses).reshape(-1, 3)
-        inside[scans] = vertex.id.index
+        inside[scans] = vertex.id.number
     return MemberRun(
         robot=robot.name,
         told=story.told,

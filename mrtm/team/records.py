@@ -79,7 +79,7 @@ class VertexRecord:
     @property
     def key(self) -> Key:
         """(vertex, robot, index)."""
-        return Key(self.kind, self.id.robot, self.id.index)
+        return Key(self.kind, self.id.robot, self.id.number)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +162,7 @@ class MapRecord:
     @property
     def key(self) -> Key:
         """(map, robot, index of the vertex)."""
-        return Key(self.kind, self.vertex.robot, self.vertex.index)
+        return Key(self.kind, self.vertex.robot, self.vertex.number)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

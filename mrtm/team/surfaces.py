@@ -20,7 +20,7 @@ class Surfaces(Mapping[VertexId, Surface]):
         self._kept: dict[VertexId, Surface] = {}  # else what nobody holds is forgotten
 
     def __getitem__(self, vertex: VertexId) -> Surface:
-        item = self._store.item(Key(Kind.MAP, vertex.robot, vertex.index))
+        item = self._store.item(Key(Kind.MAP, vertex.robot, vertex.number))
         found = _shared.get(item.hash)
         if found is None:
             record = item.record

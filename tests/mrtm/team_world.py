@@ -35,13 +35,13 @@ def own_records(world: TeamWorld, name: str, loops: int = 0, false_loops: int = 
     rng = np.random.default_rng((world.seed, len(name), loops))
     records: list[Record] = []
     for vertex in world.graphs[name].vertices():
-        time = BETWEEN * vertex.index
+        time = BETWEEN * vertex.number
         records += [VertexRecord(vertex, 0, time, 0), VertexRecord(vertex, 1, time + BETWEEN, 30)]
     for edge in world.graphs[name].edges():
         assert isinstance(edge, Edge)
-        records.append(EdgeRecord(edge, BETWEEN * edge.head.index))
+        records.append(EdgeRecord(edge, BETWEEN * edge.head.number))
         if edge.id.number % 2:
-            records.append(EdgeRecord(second_version(edge), BETWEEN * (edge.head.index + 1)))
+            records.append(EdgeRecord(second_version(edge), BETWEEN * (edge.head.number + 1)))
     for number in range(loops + false_loops):
         i, k = sorted(rng.choice(world.vertices, 2, replace=False).tolist())
         tail, head = VertexId(name, i), VertexId(name, k)
@@ -64,7 +64,7 @@ def met(hypotheses: Sequence[Hypothesis]) -> list[list[Record]]:
     """For each sighting its records: what was seen, and where both robots were, first roughly and then for good."""
     found = []
     for place, h in enumerate(hypotheses):
-        (observer, number), time = h.id, BETWEEN * (1 + max(h.observer.index, h.observed.index))
+        (observer, number), time = h.id, BETWEEN * (1 + max(h.observer.number, h.observed.number))
         ends = ((h.observer, h.tail_T_observer), (h.observed, h.head_T_observed))
         seen = SightingRecord(
             observer, number, 0, time, h.observed.robot, h.sighting, (observer, place), (h.observed.robot, place)

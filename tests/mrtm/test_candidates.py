@@ -18,19 +18,19 @@ class World:
 
     def __init__(self, count: int, step: float, sigma: float) -> None:
         self.maps: dict[VertexId, Surface] = {VertexId("red", i): MAP for i in range(count)}
-        self.poses = {v: gtsam.Pose2(step * v.index, 0.0, 0.0) for v in self.maps}
+        self.poses = {v: gtsam.Pose2(step * v.number, 0.0, 0.0) for v in self.maps}
         self.covariance = np.diag([sigma**2, sigma**2, 0.01**2])
         self.asked: list[tuple[int, int]] = []
 
     def relatives(self, pairs: list[tuple[VertexId, VertexId]]) -> list[UncertainPose]:
-        self.asked += [(a.index, b.index) for a, b in pairs]
+        self.asked += [(a.number, b.number) for a, b in pairs]
         return [UncertainPose(self.poses[a].between(self.poses[b]), self.covariance) for a, b in pairs]
 
     def found(self, changed: set[int] | None = None, most: int = 99) -> list[tuple[int, int]]:
         def wanted(a: VertexId, b: VertexId) -> bool:
-            return changed is None or bool({a.index, b.index} & changed)
+            return changed is None or bool({a.number, b.number} & changed)
 
-        return [(c.a.index, c.b.index) for c in pairs(self.maps, self.poses, self.relatives, wanted, most)]
+        return [(c.a.number, c.b.number) for c in pairs(self.maps, self.poses, self.relatives, wanted, most)]
 
 
 def test_neighbours_that_overlap_the_largest_overlap_first() -> None:

@@ -152,7 +152,7 @@ def test_robots_whose_sightings_are_judged_otherwise_are_joined_anew() -> None:
     """Alignments found where the robots seemed to be do not hold them there."""
     step, inter = gtsam.Pose2(5.0, 0.0, 0.2), EdgeKind.INTER_VERTEX
     ways = [(VertexId(robot, n), VertexId(robot, n + 1)) for robot in ("a", "b") for n in range(6)]
-    way = [Edge(EdgeId(u.robot, u.index), 0, inter, u, v, step, STEP) for u, v in ways]
+    way = [Edge(EdgeId(u.robot, u.number), 0, inter, u, v, step, STEP) for u, v in ways]
     joint = JointMap()
     joint.learn(way)
     poses = {v: pose for graph in joint.robots.values() for v, pose in graph.estimates().items()}

@@ -125,7 +125,7 @@ def test_estimate_is_the_batch_optimum_after_every_change(seed: int) -> None:
     number = 100
     for edge in world.chain():
         graph.update(add=[edge])
-        last = edge.head.index
+        last = edge.head.number
         if last > 3 and world.rng.random() < 0.5:
             back = int(world.rng.integers(0, last - 1))
             graph.update(add=[world.edge(number, last, back, EdgeKind.LOOP)])
@@ -134,7 +134,7 @@ def test_estimate_is_the_batch_optimum_after_every_change(seed: int) -> None:
     for edge_id in world.rng.permutation(24)[:6]:
         old = next(e for e in graph.edges() if e.id == EdgeId("red", int(edge_id)))
         kind = EdgeKind.COVARIANCE_INTERSECTION
-        graph.update(replace=[world.edge(old.id.number, old.tail.index, old.head.index, kind, version=1)])
+        graph.update(replace=[world.edge(old.id.number, old.tail.number, old.head.number, kind, version=1)])
         check()
     for loop in [e for e in graph.edges() if e.kind is EdgeKind.LOOP]:
         graph.update(remove=[loop.id])
@@ -631,8 +631,8 @@ def blue_world(count: int) -> tuple[World, list[Edge], gtsam.Pose2]:
             EdgeId("blue", e.id.number),
             0,
             e.kind,
-            other_vertex(e.tail.index),
-            other_vertex(e.head.index),
+            other_vertex(e.tail.number),
+            other_vertex(e.head.number),
             e.measurement,
             e.covariance,
         )

@@ -55,7 +55,7 @@ def test_what_lacks_an_end_waits(lost: object) -> None:
     expected = [
         h for h in world.hypotheses
         if (lost == (SightingRecord, "r0") and h.observer.robot == "r1")
-        or (lost == (EdgeRecord, "r1") and 0 in {v.index for v in (h.observer, h.observed) if v.robot == "r1"})
+        or (lost == (EdgeRecord, "r1") and 0 in {v.number for v in (h.observer, h.observed) if v.robot == "r1"})
     ]  # fmt: skip
     assert [h.id for h in found] == [h.id for h in sorted(expected, key=lambda h: h.id)]
     assert len(found) < 6
@@ -118,6 +118,6 @@ def test_a_bridge_only_where_no_edge_fixes_a_pose() -> None:
     made = bridges(offsets, [])
     assert len({e.id for e in made}) == 3
     for edge in made:
-        assert edge.tail.index == edge.head.index == 0
+        assert edge.tail.number == edge.head.number == 0
         assert edge.measurement.equals(offset.pose, 1e-12)
         np.testing.assert_allclose(edge.covariance, WEAK * ANCHOR)

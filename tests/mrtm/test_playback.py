@@ -35,7 +35,7 @@ def moments(world: TeamWorld) -> Moments:
     """When the sightings were made: each at a time of its own, when both robots have been where they are anchored."""
     found = []
     for place, h in enumerate(world.hypotheses):
-        later = max(h.observer.index, h.observed.index)
+        later = max(h.observer.number, h.observed.number)
         found.append((BETWEEN * (1 + later) + 0.1 * place, h))
     return sorted(found, key=lambda m: m[0])
 

@@ -37,12 +37,12 @@ def found(
 ) -> list[Candidate]:
     """``places``: here_T_vertex by the vertex's index."""
     vertices = [Vertex(VertexId("red", index)) for index in places]
-    seen = {vertex.id: places[vertex.id.index] for vertex in vertices}
+    seen = {vertex.id: places[vertex.id.number] for vertex in vertices}
     return candidates(UncertainPose(robot, covariance), vertices, seen, HALF, reach)
 
 
 def indices(chosen: list[Candidate]) -> list[int]:
-    return [candidate.vertex.id.index for candidate in chosen]
+    return [candidate.vertex.id.number for candidate in chosen]
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@ def check_complete(log: SimulatedLog, result: RunResult) -> None:
     assert np.isfinite(trajectory.poses).all()
     assert np.abs(trajectory.poses[:, 2]).max() <= np.pi + 1e-9
     np.testing.assert_allclose(trajectory.poses[0], 0.0, atol=1e-6)  # the joint frame is the first vertex's
-    assert set(trajectory.vertices) <= {v.index for v in result.vertex_poses}
+    assert set(trajectory.vertices) <= {v.number for v in result.vertex_poses}
     assert result.counts["scans"] == len(log.times)
     assert result.counts["vertices"] == len(result.vertex_poses) == len(result.local_maps)
 
@@ -108,7 +108,7 @@ def check_complete(log: SimulatedLog, result: RunResult) -> None:
         assert len(local.scans) == len(local.poses) == len(local.times) > 0
         assert (np.diff(local.scans) >= 0).all()
         taken |= set(local.scans.tolist())
-        own = trajectory.vertices[local.scans] == vertex.index
+        own = trajectory.vertices[local.scans] == vertex.number
         joint = result.vertex_poses[vertex]
         found = se2.compose(np.array([joint.x(), joint.y(), joint.theta()]), local.poses)
         once = own & np.isin(local.scans, np.flatnonzero(np.bincount(local.scans) == 1))
@@ -121,7 +121,7 @@ def check_complete(log: SimulatedLog, result: RunResult) -> None:
         assert np.isfinite(fate.chi2) or fate.fate != "accepted"
     present = Counter(edge.id for edge in accepted(result))
     assert set(present.values()) <= {1}
-    assert {VertexId(v.robot, v.index) for e in accepted(result) for v in (e.tail, e.head)} <= set(result.vertex_poses)
+    assert {VertexId(v.robot, v.number) for e in accepted(result) for v in (e.tail, e.head)} <= set(result.vertex_poses)
     for event in result.events:
         assert event.detail, event
         if event.kind == "re-entry refused":
@@ -171,7 +171,7 @@ def test_m7_a_vertex_is_made_where_the_robot_leaves_the_square(one_lap: RunResul
     edges = [e for e in accepted(one_lap) if e.kind is EdgeKind.INTER_VERTEX and e.version == 0]
     assert len(edges) >= 4
     for edge in edges:
-        assert edge.head.index == edge.tail.index + 1
+        assert edge.head.number == edge.tail.number + 1
         reached = max(abs(edge.measurement.x()), abs(edge.measurement.y()))
         assert SIDE / 2 < reached < SIDE / 2 + 0.5
         local = one_lap.local_maps[edge.head]

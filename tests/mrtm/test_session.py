@@ -64,7 +64,7 @@ def check_output(out: Path, result: RunResult) -> None:
     assert record["timings"]
     assert all(seconds >= 0.0 for seconds in record["timings"].values())
     assert [[tuple(v) for v in c] for c in record["components"]] == [
-        [(v.robot, v.index) for v in c] for c in result.components
+        [(v.robot, v.number) for v in c] for c in result.components
     ]
     assert [(e["fate"], e["version"], e["reason"]) for e in record["edges"]] == [
         (f.fate, f.edge.version, f.reason) for f in result.edges

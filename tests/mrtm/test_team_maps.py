@@ -47,7 +47,7 @@ def mine(robot: str, seed: int = 1, version: int = 1) -> list[Record]:
     records: list[Record] = [EdgeRecord(Edge(EdgeId(robot, 0), 0, EdgeKind.INTER_VERTEX, tail, head, pose, STEP), 1.0)]
     for vertex in (tail, head):
         records.append(VertexRecord(vertex, 0, 1.0, 10))
-        drawn = made(ROOM, PLACES[vertex], -1.0, 13.0, seed + vertex.index)
+        drawn = made(ROOM, PLACES[vertex], -1.0, 13.0, seed + vertex.number)
         records.append(MapRecord(vertex, version, 2.0, drawn.grid, drawn.cloud, drawn.normals))
     return records
 
@@ -108,7 +108,7 @@ def test_free_space_stays_free_when_a_map_has_travelled() -> None:
     """A map in a store has few levels of log-odds; on free cells a wall of another map must be a conflict still."""
     one = teammate("blue", walk())
     for record in one.store.of(MapRecord):
-        fresh = Surface.of(made(ROOM, PLACES[record.vertex], -1.0, 13.0, 1 + record.vertex.index))
+        fresh = Surface.of(made(ROOM, PLACES[record.vertex], -1.0, 13.0, 1 + record.vertex.number))
         kept = Surface.of(record)
         for kind in (1, 2, 3):  # surface, clearly free, other
             counts = [int(np.count_nonzero(s.lookup.kinds == kind)) for s in (kept, fresh)]

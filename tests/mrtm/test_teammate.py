@@ -142,7 +142,7 @@ def test_an_edge_may_be_the_last_to_come() -> None:
     """It makes the vertex known in which a sighting was made: no anchor and no sighting comes after it."""
     world = chain(4, 2, sightings=6)
     told = everything(world, 0, 0)
-    seen = max(h.observed.index if h.observed.robot == "r1" else h.observer.index for h in world.hypotheses)
+    seen = max(h.observed.number if h.observed.robot == "r1" else h.observer.number for h in world.hypotheses)
     late = [r for r in told if isinstance(r, EdgeRecord) and r.edge.id == EdgeId("r1", seen)]
     one = teammate("r0", [r for r in told if r not in late])
     one.think()
@@ -190,9 +190,9 @@ def test_an_anchor_that_moves_to_another_vertex_moves_the_edge() -> None:
     world = chain(6, 2, sightings=6)
     told = everything(world, 0, 0)
     first = next(
-        r for r in told if isinstance(r, AnchorRecord) and r.version == 1 and r.robot == "r1" and r.vertex.index > 0
+        r for r in told if isinstance(r, AnchorRecord) and r.version == 1 and r.robot == "r1" and r.vertex.number > 0
     )
-    other = VertexId("r1", first.vertex.index - 1)
+    other = VertexId("r1", first.vertex.number - 1)
     pose = world.truth[other].between(world.truth[first.vertex]).compose(first.pose.pose)
     moved = AnchorRecord("r1", first.number, 2, 99.0, other, UncertainPose(pose, first.pose.covariance))
     one = teammate("r0", told)
@@ -381,7 +381,7 @@ def renamed(records: Iterable[Record], names: dict[str, str]) -> list[Record]:
     """The same told by robots of other names."""
 
     def vertex(v: VertexId) -> VertexId:
-        return VertexId(names[v.robot], v.index)
+        return VertexId(names[v.robot], v.number)
 
     found: list[Record] = []
     for r in records:

@@ -56,7 +56,7 @@ def test_edges_come_in_the_order_of_a_drive(ring: PoseGraph) -> None:
     assert len(ring.edges) == 43
     known = {0}
     for edge in ring.edges:
-        ends = {edge.tail.index, edge.head.index}
+        ends = {edge.tail.number, edge.head.number}
         assert len(ends - known) == (edge.kind is EdgeKind.INTER_VERTEX)  # every loop has both its poses
         known |= ends
     assert ring.truth is not None
@@ -66,7 +66,7 @@ def test_edges_come_in_the_order_of_a_drive(ring: PoseGraph) -> None:
 
 def test_a_cut_graph_has_the_poses_asked_for(folder: Path) -> None:
     (graph,) = find_pose_graphs([folder], poses=14)
-    assert {edge.head.index for edge in graph.edges} | {0} == set(range(14))
+    assert {edge.head.number for edge in graph.edges} | {0} == set(range(14))
     assert [edge.kind for edge in graph.edges].count(EdgeKind.LOOP) == 1
     assert graph.truth is not None
     assert len(graph.truth) == 14

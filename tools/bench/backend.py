@@ -45,12 +45,12 @@ class BareIsam:
         """See ``Backend``."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         graph.push_back(_factor(edge))
-        if edge.head.index == self._poses:
-            before = self._isam.calculateEstimatePose2(edge.tail.index)
-            values.insert(edge.head.index, before.compose(edge.measurement))
+        if edge.head.number == self._poses:
+            before = self._isam.calculateEstimatePose2(edge.tail.number)
+            values.insert(edge.head.number, before.compose(edge.measurement))
             self._poses += 1
         self._isam.update(graph, values)
-        self._isam.calculateEstimatePose2(edge.head.index)
+        self._isam.calculateEstimatePose2(edge.head.number)
 
     def values(self) -> gtsam.Values:
         """See ``Backend``."""
@@ -77,7 +77,7 @@ class Joint:
         """See ``Backend``."""
         values = gtsam.Values()
         for vertex, pose in self._graph.estimates().items():
-            values.insert(vertex.index, pose)
+            values.insert(vertex.number, pose)
         return values
 
 
@@ -172,7 +172,7 @@ def backend_report(graphs: Sequence[tuple[PoseGraph, Sequence[Fed]]], setting: S
 
 
 def _factor(edge: Edge) -> gtsam.NoiseModelFactor:
-    return without_kernel(factor_of(edge, edge.tail.index, edge.head.index))
+    return without_kernel(factor_of(edge, edge.tail.number, edge.head.number))
 
 
 def _problem(edges: Sequence[Edge]) -> gtsam.NonlinearFactorGraph:

@@ -191,7 +191,7 @@ class Team:
         """later_T_earlier of two vertices of a robot, by odometry."""
         robot = int(later.robot)
         times = self._times[robot]
-        return inverse(self._odometry[robot].motion(times[earlier.index], times[later.index]))
+        return inverse(self._odometry[robot].motion(times[earlier.number], times[later.number]))
 
     def _sighting_edge(self, waiting: Waiting) -> SightingEdge:
         anchored = AnchoredSighting(waiting.sighting, waiting.observer, waiting.observed, _AT_VERTEX, _AT_VERTEX)

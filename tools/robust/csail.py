@@ -27,14 +27,14 @@ def csail(data: Path) -> Problem:
     """
     folder = data / FOLDER
     way = [
-        Edge(EdgeId(tail.robot, head.index), 0, EdgeKind.INTER_VERTEX, tail, head, pose, covariance)
+        Edge(EdgeId(tail.robot, head.number), 0, EdgeKind.INTER_VERTEX, tail, head, pose, covariance)
         for name in ("CSAIL_robot1.g2o", "CSAIL_robot2.g2o")
         for tail, head, pose, covariance in _read(folder / name)
     ]
     true = {(tail, head) for tail, head, *_ in _read(folder / "CSAIL_interrobot_loop_closures.g2o")}
     claims = [
         Claim(
-            max(tail.index, head.index),
+            max(tail.number, head.number),
             EdgeKind.LOOP if tail.robot == head.robot else EdgeKind.FUSING,
             tail, head, pose, covariance, (tail, head) in true,
         )

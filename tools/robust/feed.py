@@ -55,7 +55,7 @@ def feed(problem: Problem, every: int = 1) -> Outcome:
     steps: defaultdict[int, list[Record]] = defaultdict(list)
     alignments: defaultdict[int, list[Edge]] = defaultdict(list)
     for edge in problem.way:
-        step = edge.head.index
+        step = edge.head.number
         steps[step] += [VertexRecord(v, 0, float(step), 1) for v in (edge.tail, edge.head)]
         steps[step].append(EdgeRecord(edge, float(step)))
     for number, claim in enumerate(problem.claims, _FIRST):

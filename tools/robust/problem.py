@@ -93,7 +93,7 @@ class Building:
         turn = self._rng.uniform([3.0, 3.0, 0.5], [8.0, 8.0, 2.0])
         while True:
             first = self._random(kind)
-            ends = [(VertexId(v.robot, v.index + n) for v in (first.tail, first.head)) for n in range(count)]
+            ends = [(VertexId(v.robot, v.number + n) for v in (first.tail, first.head)) for n in range(count)]
             pairs = [(tail, head) for tail, head in ends]
             if all(v in self._truth for pair in pairs for v in pair):
                 return [self._claim(kind, *pair, true=False, moved=gtsam.Pose2(*turn)) for pair in pairs]
@@ -134,9 +134,9 @@ class Building:
         found = []
         for head, place in self._places.items():
             if kind is EdgeKind.LOOP:
-                others = [VertexId(head.robot, i) for i in range(head.index - 2)]
+                others = [VertexId(head.robot, i) for i in range(head.number - 2)]
             elif kind is EdgeKind.FUSING:  # in sight of each other at the same time, or a little later
-                others = [v for v in self._truth if v.robot < head.robot and abs(v.index - head.index) < 3]
+                others = [v for v in self._truth if v.robot < head.robot and abs(v.number - head.number) < 3]
             else:
                 others = [v for v in self._truth if v.robot < head.robot]
             near = [v for v in others if np.hypot(*(self._places[v] - place)) < REACH]
@@ -151,7 +151,7 @@ class Building:
         vertices = list(self._truth)
         while True:
             tail, head = (vertices[int(i)] for i in self._rng.choice(len(vertices), 2, replace=False))
-            if (tail.robot == head.robot) is (kind is EdgeKind.LOOP) and abs(tail.index - head.index) > 1:
+            if (tail.robot == head.robot) is (kind is EdgeKind.LOOP) and abs(tail.number - head.number) > 1:
                 return tail, head
 
     def _random(self, kind: EdgeKind) -> Claim:
@@ -161,7 +161,7 @@ class Building:
             off = self._truth[tail].between(self._truth[head]).between(pose)
             far = np.hypot(off.x(), off.y()) > APART or abs(off.theta()) > TURNED
             if far and self._is_free(kind, tail, head):
-                return Claim(max(tail.index, head.index), kind, tail, head, pose, _NOISE[kind], False)
+                return Claim(max(tail.number, head.number), kind, tail, head, pose, _NOISE[kind], False)
 
     def _claim(
         self, kind: EdgeKind, tail: VertexId, head: VertexId, true: bool, moved: gtsam.Pose2 | None = None
@@ -169,7 +169,7 @@ class Building:
         """The true transform with noise, or as if all that is around ``head`` were ``moved`` in the world."""
         at = self._truth[head] if moved is None else moved.compose(self._truth[head])
         pose = self._noisy(self._truth[tail].between(at), _NOISE[kind])
-        return Claim(max(tail.index, head.index), kind, tail, head, pose, _NOISE[kind], true)
+        return Claim(max(tail.number, head.number), kind, tail, head, pose, _NOISE[kind], true)
 
     def _is_free(self, kind: EdgeKind, tail: VertexId, head: VertexId) -> bool:
         """Two maps have one alignment."""

@@ -134,11 +134,9 @@ def factorise(starts, rows, diagonal, below):  # type: ignore[no-untyped-def]
             multiply(upper[p], inverse, below[p])
         for q in range(starts[j], starts[j + 1]):
             k = rows[q]
+            _subtract(upper[q], below[q], diagonal[k])
             at = starts[k]
-            for p in range(q, starts[j + 1]):
-                if p == q:
-                    _subtract(upper[p], below[q], diagonal[k])
-                    continue
+            for p in range(q + 1, starts[j + 1]):
                 while rows[at] != rows[p]:
                     at += 1
                 _subtract(upper[p], below[q], below[at])
@@ -172,22 +170,26 @@ def substitute(starts, rows, diagonal, below, vector):  # type: ignore[no-untype
 
 @njit(cache=True)
 def _invert(starts, rows, diagonal, below, found_diagonal, found_below):  # type: ignore[no-untyped-def]
-    total = np.empty((3, 3))
-    for j in range(len(diagonal) - 1, -1, -1):
+    n = len(diagonal)
+    widest = 0
+    for j in range(n):
+        widest = max(widest, starts[j + 1] - starts[j])
+    sums = np.empty((widest, 3, 3))
+    for j in range(n - 1, -1, -1):
+        first, end = starts[j], starts[j + 1]
+        sums[: end - first] = 0.0
+        for q in range(first, end):  # each block of the inverse between two of the rows counts for both
+            k = rows[q]
+            _add(found_diagonal[k], below[q], sums[q - first])
+            at = starts[k]
+            for p in range(q + 1, end):
+                while rows[at] != rows[p]:
+                    at += 1
+                _add(found_below[at], below[q], sums[p - first])
+                _add_turned(found_below[at], below[p], sums[q - first])
         found_diagonal[j] = diagonal[j]
-        for p in range(starts[j], starts[j + 1]):
-            i = rows[p]
-            total[:] = 0.0
-            for q in range(starts[j], starts[j + 1]):
-                k = rows[q]
-                if k == i:
-                    _add(found_diagonal[i], False, below[q], total)
-                elif k < i:
-                    _add(found_below[slot(starts, rows, i, k)], False, below[q], total)
-                else:
-                    _add(found_below[slot(starts, rows, k, i)], True, below[q], total)
-            found_below[p] = -total
-        for p in range(starts[j], starts[j + 1]):
+        for p in range(first, end):
+            found_below[p] = -sums[p - first]
             for r in range(3):
                 for c in range(3):
                     for s in range(3):
@@ -234,26 +236,65 @@ def _inverse(a, out):  # type: ignore[no-untyped-def]
     return True
 
 
+# Each loads its right factor first: as far as the compiler knows ``out`` may lie in it, and to load it again for every
+# product takes five times as long.
+
+
 @njit(cache=True)
 def multiply(a, b, out):  # type: ignore[no-untyped-def]
     """``out`` = a b."""
+    b00, b01, b02, b10, b11, b12, b20, b21, b22 = _entries(b)
     for r in range(3):
-        for c in range(3):
-            out[r, c] = a[r, 0] * b[0, c] + a[r, 1] * b[1, c] + a[r, 2] * b[2, c]
+        x, y, z = a[r, 0], a[r, 1], a[r, 2]
+        out[r, 0] = x * b00 + y * b10 + z * b20
+        out[r, 1] = x * b01 + y * b11 + z * b21
+        out[r, 2] = x * b02 + y * b12 + z * b22
+
+
+@njit(cache=True)
+def multiply_turned(a, b, out):  # type: ignore[no-untyped-def]
+    """``out`` = a' b."""
+    b00, b01, b02, b10, b11, b12, b20, b21, b22 = _entries(b)
+    for r in range(3):
+        x, y, z = a[0, r], a[1, r], a[2, r]
+        out[r, 0] = x * b00 + y * b10 + z * b20
+        out[r, 1] = x * b01 + y * b11 + z * b21
+        out[r, 2] = x * b02 + y * b12 + z * b22
 
 
 @njit(cache=True)
 def _subtract(a, b, out):  # type: ignore[no-untyped-def]
     """``out`` -= a b'."""
+    b00, b01, b02, b10, b11, b12, b20, b21, b22 = _entries(b)
     for r in range(3):
-        for c in range(3):
-            out[r, c] -= a[r, 0] * b[c, 0] + a[r, 1] * b[c, 1] + a[r, 2] * b[c, 2]
+        x, y, z = a[r, 0], a[r, 1], a[r, 2]
+        out[r, 0] -= x * b00 + y * b01 + z * b02
+        out[r, 1] -= x * b10 + y * b11 + z * b12
+        out[r, 2] -= x * b20 + y * b21 + z * b22
 
 
 @njit(cache=True)
-def _add(a, turned, b, out):  # type: ignore[no-untyped-def]
-    """``out`` += a b, or a' b."""
+def _add(a, b, out):  # type: ignore[no-untyped-def]
+    """``out`` += a b."""
+    b00, b01, b02, b10, b11, b12, b20, b21, b22 = _entries(b)
     for r in range(3):
-        for c in range(3):
-            for s in range(3):
-                out[r, c] += (a[s, r] if turned else a[r, s]) * b[s, c]
+        x, y, z = a[r, 0], a[r, 1], a[r, 2]
+        out[r, 0] += x * b00 + y * b10 + z * b20
+        out[r, 1] += x * b01 + y * b11 + z * b21
+        out[r, 2] += x * b02 + y * b12 + z * b22
+
+
+@njit(cache=True)
+def _add_turned(a, b, out):  # type: ignore[no-untyped-def]
+    """``out`` += a' b."""
+    b00, b01, b02, b10, b11, b12, b20, b21, b22 = _entries(b)
+    for r in range(3):
+        x, y, z = a[0, r], a[1, r], a[2, r]
+        out[r, 0] += x * b00 + y * b10 + z * b20
+        out[r, 1] += x * b01 + y * b11 + z * b21
+        out[r, 2] += x * b02 + y * b12 + z * b22
+
+
+@njit(cache=True)
+def _entries(a):  # type: ignore[no-untyped-def]
+    return a[0, 0], a[0, 1], a[0, 2], a[1, 0], a[1, 1], a[1, 2], a[2, 0], a[2, 1], a[2, 2]

@@ -18,6 +18,7 @@ from mrtm.joint.sightings.block_cholesky import (
     factorise,
     inverse_of_factors,
     multiply,
+    multiply_turned,
     pattern_of,
     slot,
     substitute,
@@ -159,7 +160,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
             else:
                 j = e - split
                 innovation(full[j], measured[j], tail_anchor[j], head_anchor[j], predicted, pose, r, h)
-                _turned_product(h, weights[j], mixed)
+                multiply_turned(h, weights[j], mixed)
                 multiply(mixed, h, information)
                 _times(mixed, r, g)
             # A step of the head counts as it is, one of the tail as seen from the head.
@@ -169,7 +170,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
                 diagonal[place[head]] += information
                 vector[place[head]] += g
             if tail >= 0:
-                _turned_product(back, information, mixed)
+                multiply_turned(back, information, mixed)
                 multiply(mixed, back, h)
                 diagonal[place[tail]] += h
                 for a in range(3):
@@ -211,14 +212,6 @@ def _back(pose, out):  # type: ignore[no-untyped-def]
     out[0, 0], out[0, 1], out[0, 2] = -c, -s, -y
     out[1, 0], out[1, 1], out[1, 2] = s, -c, x
     out[2, 0], out[2, 1], out[2, 2] = 0.0, 0.0, -1.0
-
-
-@njit(cache=True)
-def _turned_product(a, b, out):  # type: ignore[no-untyped-def]
-    """a' b."""
-    for r in range(3):
-        for c in range(3):
-            out[r, c] = a[0, r] * b[0, c] + a[1, r] * b[1, c] + a[2, r] * b[2, c]
 
 
 @njit(cache=True)

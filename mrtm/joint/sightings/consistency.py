@@ -101,10 +101,12 @@ def judge(
             raise ValueError(f"sighting {one.id} is there twice")
     usable = [h for h in ordered if set(h.robots) <= graphs.keys()]
     joining, slack = _explain(usable, _own_maps(usable, graphs), evidence)
-    judgements = {h.id: _unknown(h, graphs) for h in ordered}
+    known: dict[HypothesisId, Judgement] = {}
     for pair, rows in joining.rows.items():
+        believed = int(np.count_nonzero(joining.believed[rows]))
         for place, row in enumerate(rows.tolist()):
-            judgements[usable[row].id] = _judgement(usable[row], joining, pair, row, place)
+            known[usable[row].id] = _judgement(usable[row], joining, pair, row, place, believed)
+    judgements = {h.id: known.get(h.id) or _unknown(h, graphs) for h in ordered}
     return Consistency(judgements, joining.offsets(), joining.components(), slack)
 
 
@@ -147,8 +149,8 @@ def _unknown(hypothesis: Hypothesis, graphs: Mapping[str, RobotGraph]) -> Judgem
     return Judgement(hypothesis.id, Verdict.WAITING, f"nothing is known of the map of {missing}", 1, 0, None)
 
 
-def _judgement(hypothesis: Hypothesis, joining: Joining, pair: Pair, row: int, place: int) -> Judgement:
-    """Verdict and reason for sighting ``row``, the one at ``place`` of its pair."""
+def _judgement(hypothesis: Hypothesis, joining: Joining, pair: Pair, row: int, place: int, believed: int) -> Judgement:
+    """Verdict and reason for sighting ``row``, the one at ``place`` of its pair, of which so many are ``believed``."""
     finding, rows = joining.findings[pair], joining.rows[pair]
     names = f"{pair[0]} and {pair[1]}"
     own = next((s for s in finding.sets if s.members[place]), None)
@@ -162,7 +164,7 @@ def _judgement(hypothesis: Hypothesis, joining: Joining, pair: Pair, row: int, p
             verdict, reason = Verdict.WAITING, _doubt(finding, names, support, rival)
         return Judgement(hypothesis.id, verdict, reason, support, rival, None)
     if joining.believed[row]:
-        support = int(np.count_nonzero(joining.believed[rows]))
+        support = believed
         word = "the local maps agree" if joining.lifted[row] else f"chi2 {chi2:.1f} of at most {gate:.1f}"
         verdict, reason = Verdict.ACCEPTED, f"{support} of {len(rows)} sightings of {names} agree, {word}"
     elif chi2 < gate:

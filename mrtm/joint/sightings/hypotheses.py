@@ -54,6 +54,7 @@ class Hypothesis:
         tail_T_observer: the observer's pose in its vertex, covariance in the frame of the robot.
         head_T_observed: the observed robot's pose in its vertex, likewise.
         anchors: x, y, theta of these two.
+        robots: the two, in the order of their names.
 
     Raises:
         ValueError: if both vertices are of one robot.
@@ -66,18 +67,14 @@ class Hypothesis:
     tail_T_observer: UncertainPose
     head_T_observed: UncertainPose
     anchors: tuple[list[float], list[float]] = field(init=False)
+    robots: tuple[str, str] = field(init=False)
 
     def __post_init__(self) -> None:
         if self.observer.robot == self.observed.robot:
             raise ValueError(f"sighting {self.id}: robot {self.observer.robot} cannot sight itself")
         anchors = coordinates(self.tail_T_observer.pose), coordinates(self.head_T_observed.pose)
         object.__setattr__(self, "anchors", anchors)
-
-    @property
-    def robots(self) -> tuple[str, str]:
-        """The two robots, in the order of their names."""
-        first, second = sorted((self.observer.robot, self.observed.robot))
-        return first, second
+        object.__setattr__(self, "robots", tuple(sorted((self.observer.robot, self.observed.robot))))
 
 
 class RobotGraph(Protocol):
