@@ -149,16 +149,11 @@ class JointGraph:
         return self._smoother.marginal(self._key(vertex))
 
     def relative(self, a: VertexId, b: VertexId) -> UncertainPose:
-        """a_T_b and its (3, 3) covariance in the frame of b, from the joint covariance of both (M6).
-
-        The first call for an ``a`` after an update costs one elimination of the graph; any ``b`` after it, little.
-        """
-        start, end = self._key(a), self._key(b)
-        pose = self._smoother.pose(start).between(self._smoother.pose(end))
-        return UncertainPose(pose, self._smoother.covariance_seen_from(start, end))
+        """a_T_b and its (3, 3) covariance in the frame of b, from the joint covariance of both."""
+        return self.relatives([(a, b)])[0]
 
     def relatives(self, pairs: Sequence[tuple[VertexId, VertexId]]) -> list[UncertainPose]:
-        """``relative`` of many pairs: about one elimination of the graph for all of them."""
+        """``relative`` of many pairs (M6): about one elimination of the graph for all of them."""
         for pair in pairs:
             for end in pair:
                 self._key(end)

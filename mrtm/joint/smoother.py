@@ -49,13 +49,7 @@ _FAR = 0.01
 _MAX_STEPS = 15
 _NEVER = 2**31 - 1  # updates
 
-# Factors in all the eliminations that are kept for further questions, seen from one pose each: about 10 kB a factor.
-_KEPT = 1_000
-
 TOGETHER = 64  # pairs of poses whose covariance is found at once
-
-# Standard deviation that stands for "this pose is the reference": nothing against any measurement.
-_REFERENCE_SIGMA = 1e-6
 
 
 class Smoother:
@@ -80,7 +74,6 @@ class Smoother:
         self._factors: dict[EdgeId, gtsam.NoiseModelFactor] = {}
         self._factorization = "CHOLESKY"
         self._values: gtsam.Values | None = None
-        self._seen_from: dict[int, gtsam.ISAM2] = {}
         self._waited = 0  # updates since one that linearised a portion anew
         self._behind = False  # whether that left some for the next
         self._start(factors, values)
@@ -165,25 +158,8 @@ class Smoother:
         """(3, 3) covariance of the pose of ``key``, in its own frame."""
         return _symmetric(self._isam.marginalCovariance(key))
 
-    def covariance_seen_from(self, reference: int, key: int) -> FloatArray:
-        """(3, 3) covariance of reference_T_key, in the frame of ``key``, from the joint covariance of both.
-
-        All factors but the prior are relative, so a covariance between two poses does not depend on which pose
-        the prior holds. With the prior moved to ``reference`` it is the plain marginal of ``key``: one
-        elimination serves all keys, with no difference of large numbers.
-        """
-        if reference not in self._seen_from:
-            graph = self.graph()
-            noise = gtsam.noiseModel.Isotropic.Sigma(3, _REFERENCE_SIGMA)
-            graph.push_back(gtsam.PriorFactorPose2(reference, self.pose(reference), noise))
-            self._seen_from[reference] = gtsam.ISAM2(_parameters(_EXACT, "QR"))
-            self._seen_from[reference].update(graph, self.values())
-            while len(self._seen_from) > 1 and len(self._seen_from) * len(self._factors) > _KEPT:
-                del self._seen_from[next(iter(self._seen_from))]
-        return _symmetric(self._seen_from[reference].marginalCovariance(key))
-
     def relative_covariances(self, pairs: Sequence[tuple[int, int]]) -> list[FloatArray]:
-        """As ``covariance_seen_from``, for every pair of a reference and a key, which may be the same.
+        """(3, 3) covariance of reference_T_key, in the frame of ``key``, for every such pair, which may be the same.
 
         Of a single pair it comes from iSAM2's own joint marginal: near the newest keys that is a hundred times faster
         than to eliminate all, and good to a part in a thousand or so, as far as iSAM2 has linearised anew. Of several
@@ -298,7 +274,6 @@ class Smoother:
         self._slots.update(zip(solved, result.getNewFactorsIndices(), strict=True))
         self._size += values.size() - result.getUnusedKeys().size()
         self._values = None
-        self._seen_from = {}
 
     def _estimate_of(self, keys: list[int], new: gtsam.Values) -> gtsam.Values:
         """The estimate of some keys, or what is given of them if they are new."""

@@ -1,6 +1,6 @@
 """One robot's TM-SLAM: steps M1 to M8, scan by scan."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, Protocol
 
@@ -26,8 +26,8 @@ class Joint(Protocol):
     def update(self, *, add: Iterable[Edge] = (), replace: Iterable[Edge] = ()) -> None:
         """Enter new edges and new versions of known ones."""
 
-    def relative(self, a: VertexId, b: VertexId) -> UncertainPose:
-        """a_T_b with its covariance in the frame of b."""
+    def relatives(self, pairs: Sequence[tuple[VertexId, VertexId]]) -> list[UncertainPose]:
+        """a_T_b with its covariance in the frame of b, for every pair."""
 
 
 class Robot:
@@ -187,12 +187,13 @@ class Robot:
     def _candidates(self, robot: UncertainPose, half_width: float) -> list[Candidate]:
         """M6."""
         p = self.config.topology
+        here, others = self._here.id, [v for v in self.topology.vertices if v is not self._here]
         with self._stages("joint map"):
             if p.projection == "dijkstra":
-                seen = self.topology.along_shortest_paths(self._here.id)
+                seen = self.topology.along_shortest_paths(here)
             else:
-                seen = {v.id: self._joint.relative(self._here.id, v.id) for v in self.topology.vertices}
-        others = [v for v in self.topology.vertices if v is not self._here]
+                poses = self._joint.relatives([(here, v.id) for v in others])
+                seen = {v.id: pose for v, pose in zip(others, poses, strict=True)}
         return candidates(robot, others, seen, half_width, p.reach)[: p.candidates]
 
     def _fits(self, candidate: Candidate, points: Points) -> tuple[FloatArray, FloatArray] | None:

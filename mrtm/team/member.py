@@ -206,9 +206,9 @@ class _ToldGraph:
         for edge in (*add, *replace):
             self._story.tell(EdgeRecord(edge, self._story.now))
 
-    def relative(self, a: VertexId, b: VertexId) -> UncertainPose:
+    def relatives(self, pairs: Sequence[tuple[VertexId, VertexId]]) -> list[UncertainPose]:
         """See ``JointGraph``."""
-        return self._graph.relative(a, b)
+        return self._graph.relatives(pairs)
 
 
 def _run(robot: Robot, story: _Story, stages: Stages) -> MemberRun:

@@ -145,7 +145,7 @@ def _seen_from(
 ) -> FloatArray:
     """NEES over degrees of freedom of other vertices as seen from a ``reference``."""
     others = [v for v in vertices if v != reference]
-    seen = [graph.relative(reference, v) for v in others]
+    seen = graph.relatives([(reference, v) for v in others])
     return nees(
         np.array([se2.between(true[reference], true[v]) for v in others]),
         np.array([_coordinates(one.pose) for one in seen]),
