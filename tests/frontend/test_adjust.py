@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from frontend import adjust, motion, refine, se2
+from frontend import adjust, adjust_equations, motion, refine, se2, skyline
 from frontend.adjust import Adjusted
 from frontend.points import Points, points_of
 from frontend.records import FloatArray
@@ -31,11 +31,11 @@ def test_the_solver_solves_and_inverts(poses: int) -> None:
     full = banded(rng, 3 * poses)
     right, headings = rng.normal(size=3 * poses), rng.uniform(-3, 3, poses)
     factor, solution = np.tril(full), right.copy()
-    first = kernels._factorise(factor)
-    kernels._solve(factor, first, solution)
+    first = skyline.factorise(factor)
+    skyline.solve(factor, first, solution)
     np.testing.assert_allclose(full @ solution, right, atol=1e-8)
     inverse = np.linalg.inv(full)
-    for i, block in enumerate(kernels._marginals(factor, first, headings)):
+    for i, block in enumerate(skyline.marginals(factor, first, headings)):
         c, s = np.cos(headings[i]), np.sin(headings[i])
         rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
         expected = rotation @ inverse[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] @ rotation.T
@@ -57,7 +57,7 @@ def test_eliminating_surfels_is_least_squares_with_them() -> None:
     normal[3 * poses, 3 * poses] = 1.0  # row 0 of the table stands for no surfel
     expected = np.linalg.solve(normal, -(design.T * weight) @ error)
     information, right = np.zeros((3 * poses, 3 * poses)), np.zeros(3 * poses)
-    squares, _, free = kernels._reduce(scan, surfel, jacobian, error, weight, known, information, right)
+    squares, _, free = adjust_equations.reduce(scan, surfel, jacobian, error, weight, known, information, right)
     assert free == surfels - 5
     full = np.tril(information) + np.tril(information, -1).T + 1e-3 * np.eye(3 * poses)
     np.testing.assert_allclose(np.linalg.solve(full, right), expected[: 3 * poses], rtol=1e-6)
