@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import gtsam
@@ -214,23 +213,6 @@ class JointGraph:
         factors = {edge.id: graph._factor(edge) for edge in graph._believed()}
         graph._smoother = Smoother(prior_factor(0, graph._root_pose), factors, values)
         return graph
-
-    def write_g2o(self, path: Path) -> None:
-        """The graph and its estimate for g2o and GTSAM: vertices numbered in the order they came, no kernels.
-
-        Doubted edges are left out, and those that do not fix a pose: neither program reads a range and bearing with
-        lever arms.
-        Written here, not by ``gtsam.writeG2o``, which keeps six digits and refuses robust factors.
-        """
-        numbers = {vertex: number for number, vertex in enumerate(self._keys)}
-        lines = [("VERTEX_SE2", numbers[v], *_coordinates(pose)) for v, pose in self.estimates().items()]
-        upper = np.triu_indices(3)
-        for e in self._believed():
-            if e.estimate is not None:
-                information = np.linalg.inv(e.covariance)[upper].tolist()
-                ends = numbers[e.tail], numbers[e.head]
-                lines.append(("EDGE_SE2", *ends, *_coordinates(e.estimate.pose), *information))
-        path.write_text("".join(" ".join(map(str, line)) + "\n" for line in lines), encoding="ascii")
 
     @contextmanager
     def _all_or_nothing(self) -> Iterator[None]:

@@ -1,7 +1,6 @@
 import json
 from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import gtsam
@@ -589,24 +588,6 @@ def test_root_may_stand_anywhere() -> None:
     assert JointGraph.restore(graph.checkpoint()).estimate(vertex(3)).equals(graph.estimate(vertex(3)), 1e-9)
 
 
-def test_g2o_is_read_back_by_gtsam(looped: tuple[World, JointGraph], tmp_path: Path) -> None:
-    _, graph = looped
-    path = tmp_path / "graph.g2o"
-    graph.write_g2o(path)
-    factors, values = gtsam.readG2o(str(path), False)
-    assert factors.size() == len(graph.edges())
-    read = {v: values.atPose2(i) for i, v in enumerate(graph.vertices())}
-    assert distance(read, graph.estimates()) < 1e-9
-    for i, edge in enumerate(graph.edges()):
-        factor = factors.at(i)
-        assert isinstance(factor, gtsam.BetweenFactorPose2)
-        assert edge.estimate is not None
-        assert factor.measured().equals(edge.estimate.pose, 1e-9)
-        noise = factor.noiseModel()
-        assert isinstance(noise, gtsam.noiseModel.Gaussian)
-        np.testing.assert_allclose(noise.covariance(), edge.covariance, rtol=1e-9, atol=1e-15)
-
-
 def test_closed_square_is_a_square() -> None:
     side, covariance = gtsam.Pose2(5.0, 0.0, np.pi / 2), np.eye(3) * 1e-2
     edges = [
@@ -785,14 +766,6 @@ def test_innovation_of_sightings_is_chi2_over_honest_worlds() -> None:
         values.append(joint.innovation(sighting(0, red, blue, offset, 5, 2)))
     # Sensor and the fusing edge's noise; the anchors are exact here, and blue's noise is the same each time.
     assert 1.2 < np.mean(values) < 2.4
-
-
-def test_g2o_leaves_out_what_fixes_no_pose(met: Met, tmp_path: Path) -> None:
-    red, blue, offset, ours, theirs = met
-    ours.merge(theirs, fusing(0, red, blue, offset, 3, 4), [sighting(0, red, blue, offset, 5, 2)])
-    ours.write_g2o(tmp_path / "graph.g2o")
-    factors, _ = gtsam.readG2o(str(tmp_path / "graph.g2o"), False)
-    assert factors.size() == len(ours.edges()) - 1
 
 
 def test_checkpoint_keeps_sightings(met: Met) -> None:
