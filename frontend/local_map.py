@@ -60,19 +60,25 @@ class Bends:
         return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
     def errors(self, shares: FloatArray) -> FloatArray:
-        """(n, 3, 3), as ``covariances``, of what was drawn from the places in (n, k) ``shares``.
+        """(n, 3, 3), as ``covariances``, of what was drawn from the places in (n, k) ``shares``."""
+        parts = shares[:, :, None] * self.roots().reshape(-1, 9)
+        shape = (len(shares), -1, 3)
+        return np.asarray(parts.reshape(shape).swapaxes(-1, -2) @ (self.together() @ parts).reshape(shape))
+
+    def roots(self) -> FloatArray:
+        """(k, 3, 3) symmetric roots of the covariances."""
+        variances, axes = np.linalg.eigh(self.covariances)
+        return np.asarray((axes * np.sqrt(np.maximum(variances, 0.0))[:, None, :]) @ np.swapaxes(axes, -1, -2))
+
+    def together(self) -> FloatArray:
+        """(k, k) how far the errors of two places are one, from 0 to 1.
 
         Errors gather on the way from the origin, and those of two places go together as far as their ways do: as in
         Brownian motion of several parameters (P. Levy, "Processus stochastiques et mouvement brownien", 1948).
         """
-        variances, axes = np.linalg.eigh(self.covariances)
-        roots = (axes * np.sqrt(np.maximum(variances, 0.0))[:, None, :]) @ np.swapaxes(axes, -1, -2)
         way = np.maximum(np.linalg.norm(self.places, axis=1), 1e-6)
         apart = np.linalg.norm(self.places[:, None] - self.places, axis=-1)
-        together = 0.5 * (way[:, None] + way - apart) / np.sqrt(way[:, None] * way)
-        parts = shares[:, :, None] * roots.reshape(-1, 9)
-        shape = (len(shares), -1, 3)
-        return np.asarray(parts.reshape(shape).swapaxes(-1, -2) @ (together @ parts).reshape(shape))
+        return np.asarray(0.5 * (way[:, None] + way - apart) / np.sqrt(way[:, None] * way))
 
 
 @dataclass(frozen=True, slots=True)

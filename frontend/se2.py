@@ -43,6 +43,18 @@ def log(a_T_b: FloatArray) -> FloatArray:
     return _pose(x, y, theta)
 
 
+def exp(tangent: FloatArray) -> FloatArray:
+    """The motion (…, 3) of a tangent vector; its angle in (-pi, pi]."""
+    theta = tangent[..., 2]
+    small = np.abs(theta) < 1e-6
+    turn = np.where(small, 1.0, theta)
+    a = np.where(small, 1.0 - theta * theta / 6.0, np.sin(turn) / turn)
+    b = np.where(small, 0.5 * theta, (1.0 - np.cos(turn)) / turn)
+    return _pose(
+        a * tangent[..., 0] - b * tangent[..., 1], b * tangent[..., 0] + a * tangent[..., 1], np.asarray(wrap(theta))
+    )
+
+
 def mean_and_covariance(poses: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean of weighted poses and their covariance in its tangent space, ``Log(mean^-1 * pose)``.
 
@@ -57,7 +69,7 @@ def mean_and_covariance(poses: FloatArray, weights: FloatArray) -> tuple[FloatAr
     for _ in range(10):
         tangent = log(between(mean, poses))
         step = weights @ tangent
-        mean = compose(mean, _exp(step))
+        mean = compose(mean, exp(step))
         if np.abs(step).max() < 1e-9:
             break
     tangent = log(between(mean, poses))
@@ -72,16 +84,6 @@ def adjoint(poses: FloatArray) -> FloatArray:
     matrix[..., 1, 0], matrix[..., 1, 1], matrix[..., 1, 2] = s, c, -poses[..., 0]
     matrix[..., 2, 2] = 1.0
     return matrix
-
-
-def _exp(tangent: FloatArray) -> FloatArray:
-    theta = float(tangent[2])
-    if abs(theta) < 1e-6:
-        a, b = 1.0 - theta * theta / 6.0, 0.5 * theta
-    else:
-        a, b = np.sin(theta) / theta, (1.0 - np.cos(theta)) / theta
-    x, y = float(tangent[0]), float(tangent[1])
-    return np.array([a * x - b * y, b * x + a * y, theta])
 
 
 def _pose(x: FloatArray, y: FloatArray, theta: FloatArray) -> FloatArray:

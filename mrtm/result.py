@@ -1,5 +1,6 @@
 """What a run leaves in memory: everything that the output writes and the evaluation measures."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,7 +19,7 @@ class Trajectory:
 
     Attributes:
         times: (n,) seconds, the log's own clock, in the order of the log (the clock may step back).
-        poses: (n, 3) joint_T_robot.
+        poses: (n, 3) joint_T_robot: the most likely ones by all edges, local maps giving way between them.
         vertices: (n,) index of the vertex in whose local map the scan lies.
     """
 
@@ -121,6 +122,10 @@ class TeamStory:
 class RunResult:
     """Everything a run knows at its end, in the joint frame of each component's root.
 
+    ``vertex_poses`` and ``vertex_covariances`` are of the vertices, the origins of the local maps, as the joint graph
+    has them. There a map is surest, but off by what gathers on its way: ``map_poses``, joint_T_local too, bring each
+    map, kept rigid, to where its scans lie in the trajectories on average. They are for drawing maps.
+
     ``timings`` are seconds by stage, ``longest`` those of the longest single call, ``latencies`` those of each event
     after which a joint map was brought up to date; these three differ from run to run. ``counts`` are plain numbers
     (scans, vertices, ...), ``blemishes`` one line each about what the log's reader met. ``components`` lists the
@@ -131,6 +136,7 @@ class RunResult:
     seed: int
     trajectories: dict[str, Trajectory]
     local_maps: dict[VertexId, LocalMap]
+    map_poses: dict[VertexId, gtsam.Pose2]
     vertex_poses: dict[VertexId, gtsam.Pose2]
     vertex_covariances: dict[VertexId, FloatArray]
     components: list[list[VertexId]]
@@ -142,3 +148,7 @@ class RunResult:
     blemishes: list[str]
     team: TeamStory | None = None
     latencies: list[Latency] = field(default_factory=list)
+
+    def placed_maps(self, vertices: Iterable[VertexId]) -> list[tuple[gtsam.Pose2, LocalMap]]:
+        """The local maps of those of the vertices that have one, each with its pose in the joint frame."""
+        return [(self.map_poses[v], self.local_maps[v]) for v in vertices if v in self.local_maps]

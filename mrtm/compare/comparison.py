@@ -139,10 +139,7 @@ def _score(way: Way, relations: Relations | None, references: Mapping[str, Timed
 
 def _crispness(result: RunResult) -> Crispness:
     """Of all components, each in its own frame, weighted by the area that overlaps."""
-    found = [
-        crispness([(result.vertex_poses[v], result.local_maps[v]) for v in component if v in result.local_maps])
-        for component in result.components
-    ]
+    found = [crispness(result.placed_maps(component)) for component in result.components]
     found = [c for c in found if c.area]
     area = sum(c.area for c in found)
     if not found:

@@ -52,8 +52,7 @@ def export(result: RunResult, out: Path) -> None:
         for number, component in enumerate(components):
             stem = out / map_stem(number)
             written |= {stem.with_suffix(suffix) for suffix in (".pgm", ".yaml", ".png")}
-            maps = [(result.vertex_poses[v], result.local_maps[v]) for v in component if v in result.local_maps]
-            write_occupancy(stem, fuse(maps, MAP_RESOLUTION))
+            write_occupancy(stem, fuse(result.placed_maps(component), MAP_RESOLUTION))
             draw_map(result, component, stem.with_suffix(".png"))
         for job in pending:
             job.result()
@@ -123,6 +122,7 @@ def _vertex_record(result: RunResult, vertex: VertexId, component: int) -> dict[
         "id": [vertex.robot, vertex.number],
         "component": component,
         "pose": _xytheta(result.vertex_poses[vertex]),
+        "map_pose": None if local_map is None else _xytheta(result.map_poses[vertex]),
         "covariance": result.vertex_covariances.get(vertex),
         "scans": 0 if local_map is None else len(local_map.times),
         "first_scan": first,

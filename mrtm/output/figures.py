@@ -27,7 +27,7 @@ def draw_map(result: RunResult, component: list[VertexId], path: Path) -> None:
     The picture is turned so that walls run along its borders, the long way across; the small cross beside the scale
     bar shows where x and y of the joint frame point.
     """
-    maps = [(result.vertex_poses[v], result.local_maps[v]) for v in component if v in result.local_maps]
+    maps = result.placed_maps(component)
     view = find_view(maps, _positions(result, component))
     width, height = max(view.width, 1500) + 2 * SIDE, view.height + HEADER + FOOTER
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)

@@ -75,7 +75,7 @@ def draw_before_and_after(ways: Sequence[tuple[str, RunResult]], component: list
     """Fig. 4: the fused map each way, and below the part where the first and the last way differ most."""
     first, last = ways[0][1], ways[-1][1]
     positions = np.concatenate([_positions(way, component) for _, way in ways])
-    whole = _fitted(find_view(_maps(last, component), positions))
+    whole = _fitted(find_view(last.placed_maps(component), positions))
     detail = _square(whole, _worst_place(first, last, component), DETAIL)
     rows = []
     for view, graph in ((whole, True), (detail, False)):
@@ -89,7 +89,7 @@ def draw_before_and_after(ways: Sequence[tuple[str, RunResult]], component: list
                     axes.plot(*(detail.low + corners).T, color="#e8590c", linewidth=2.0, zorder=5)
 
             title = name if graph else f"{name}, detail"
-            row.append(Panel(title, view, paint(_maps(way, component), view), draw))
+            row.append(Panel(title, view, paint(way.placed_maps(component), view), draw))
         rows.append(row)
     draw_sheet("fused map before and after optimisation", rows, path)
 
@@ -100,7 +100,7 @@ def draw_same_place(result: RunResult, component: list[VertexId], path: Path) ->
     if pair is None:
         path.unlink(missing_ok=True)
         return
-    angle = find_view(_maps(result, component), _positions(result, component)).angle
+    angle = find_view(result.placed_maps(component), _positions(result, component)).angle
     turned = View(angle, np.zeros(2), np.zeros(2), 1.0)
     centre = turned.turn(_positions(result, list(pair))).mean(axis=0)
     view = _square(View(angle, centre, centre, 1.0), centre, PLACE)
@@ -108,18 +108,18 @@ def draw_same_place(result: RunResult, component: list[VertexId], path: Path) ->
     one, other = (colours[v.robot] for v in pair)
     if one == other:
         other = next(c for c in robot_colours(["blue", "red"]).values() if c != one)
-    panels = [Panel(f"{v.robot}, vertex {v.number}", view, paint(_maps(result, [v]), view)) for v in pair]
-    both = _tinted([(_maps(result, [v]), colour) for v, colour in zip(pair, (one, other), strict=True)], view)
+    panels = [Panel(f"{v.robot}, vertex {v.number}", view, paint(result.placed_maps([v]), view)) for v in pair]
+    both = _tinted([(result.placed_maps([v]), colour) for v, colour in zip(pair, (one, other), strict=True)], view)
     panels.append(Panel("both, at the joint estimate", view, both))
     draw_sheet("two local maps of the same place", [panels], path)
 
 
 def draw_team(result: RunResult, component: list[VertexId], path: Path) -> None:
     """Fig. 6: the joint map with walls, vertices and edges in the colour of the robot they come from."""
-    view = find_view(_maps(result, component), _positions(result, component))
+    view = find_view(result.placed_maps(component), _positions(result, component))
     colours = robot_colours(list(result.trajectories))
     robots = [robot for robot in result.trajectories if any(v.robot == robot for v in component)]
-    layers = [(_maps(result, [v for v in component if v.robot == robot]), colours[robot]) for robot in robots]
+    layers = [(result.placed_maps([v for v in component if v.robot == robot]), colours[robot]) for robot in robots]
 
     def draw(axes: Axes) -> None:
         _draw_graph(axes, result, component, view)
@@ -131,10 +131,6 @@ def draw_team(result: RunResult, component: list[VertexId], path: Path) -> None:
 
     panel = Panel("in the colours of the robots", view, _tinted(layers, view), draw)
     draw_sheet("joint map", [[panel]], path)
-
-
-def _maps(result: RunResult, vertices: Sequence[VertexId]) -> Maps:
-    return [(result.vertex_poses[v], result.local_maps[v]) for v in vertices if v in result.local_maps]
 
 
 def _positions(result: RunResult, vertices: Sequence[VertexId]) -> FloatArray:
@@ -160,12 +156,12 @@ def _square(view: View, centre: FloatArray, size: float) -> View:
 
 def _worst_place(before: RunResult, after: RunResult, component: list[VertexId]) -> FloatArray:
     """The middle, in the frame turned as Fig. 4 is, of the square that lost most disagreement on the way."""
-    view = find_view(_maps(after, component), _positions(after, component))
+    view = find_view(after.placed_maps(component), _positions(after, component))
     box, cell = np.array([view.low, view.high]), 0.1
     turn = gtsam.Pose2(0.0, 0.0, view.angle)
 
     def disagreement(result: RunResult) -> FloatArray:
-        _, bits = opinions([(turn.compose(pose), m) for pose, m in _maps(result, component)], box, cell)
+        _, bits = opinions([(turn.compose(pose), m) for pose, m in result.placed_maps(component)], box, cell)
         return np.nan_to_num(bits)
 
     gain = uniform_filter(disagreement(before) - disagreement(after), round(DETAIL / cell), mode="constant")
@@ -185,7 +181,7 @@ def _most_overlapping(result: RunResult, component: list[VertexId]) -> tuple[Ver
     for a, b in pairs[:CANDIDATES]:
         for v in (a, b):
             lookups.setdefault(v, Lookup.of(result.local_maps[v]))
-        area = overlap(lookups[a], lookups[b], _array(result.vertex_poses[a].between(result.vertex_poses[b])))
+        area = overlap(lookups[a], lookups[b], _array(result.map_poses[a].between(result.map_poses[b])))
         if area > shared:
             best, shared = (a, b), area
     return best

@@ -2,21 +2,20 @@
 
 import heapq
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
-import gtsam
 import numpy as np
 
 from factors import GraphEdge, VertexId
-from frontend import se2
 from mrtm.config import Config
+from mrtm.joint.bending import BentMap
 from mrtm.joint.graph import JointGraph
 from mrtm.joint.sightings.consistency import Verdict
-from mrtm.result import EdgeFate, Latency, Meeting, RunResult, SightingFate, TeamStory, Trajectory
-from mrtm.robot.poses import array_of
+from mrtm.result import EdgeFate, Latency, Meeting, RunResult, SightingFate, TeamStory
 from mrtm.team.codec import pack
 from mrtm.team.exchange import exchange
 from mrtm.team.member import MemberRun
+from mrtm.team.reading_out import bent_maps, map_poses, trajectory
 from mrtm.team.records import SightingRecord
 from mrtm.team.sightings_file import TimedSighting, sighting_times
 from mrtm.team.store import item_of
@@ -66,6 +65,7 @@ class Playback:
         self._meetings: list[Meeting] = []
         self._latencies: list[Latency] = []
         self._frames: list[tuple[float, frozenset[str]]] = []  # team time and robots of every new component
+        self._bent: dict[VertexId, BentMap] = {}
 
     def play(self, report: Callable[[float], None]) -> None:
         """All meetings, and what the listener makes of it all in the end."""
@@ -83,6 +83,8 @@ class Playback:
             teammate.learn()
         before = dict(self._stages.seconds)
         self.listener.settle()
+        with self._stages("joint map"):
+            self._bent = bent_maps(self.listener.joint.components(), self.listener.aligner, self._runs)
         self._note(meetings[-1][0] if meetings else 0.0, self.listener, self._stages.since(before))
 
     def agree(self) -> bool:
@@ -130,20 +132,22 @@ class Playback:
         self._latencies.append(Latency(time, teammate.name, vertices, seconds))
 
     def result(self, config: Config) -> RunResult:
-        """What is known at the end, in the joint maps of the listener."""
+        """What is known at the end of ``play``, in the joint maps of the listener."""
         joint = self.listener.joint
         components = joint.components()
         poses = {v: pose for c in components for v, pose in c.graph.estimates().items()}
         edges = [fate for run in self._runs for fate in run.past]
         graphs = [component.graph for component in components]
+        local_maps = {vertex: local_map for run in self._runs for vertex, local_map in run.local_maps.items()}
         edges += [_edge_fate(graph, edge) for graph in graphs for edge in graph.edges()]
         stages = [*((run.seconds, run.longest) for run in self._runs), (self._stages.seconds, self._stages.longest)]
         names = list(dict.fromkeys(name for seconds, _ in stages for name in seconds))
         return RunResult(
             config=config.model_dump(mode="json"),
             seed=config.seed,
-            trajectories={run.robot: _trajectory(run, poses) for run in self._runs},
-            local_maps={vertex: local_map for run in self._runs for vertex, local_map in run.local_maps.items()},
+            trajectories={run.robot: trajectory(run, self._bent) for run in self._runs},
+            local_maps=local_maps,
+            map_poses=map_poses(self._bent, local_maps),
             vertex_poses=poses,
             vertex_covariances={v: c.graph.marginal(v) for c in components for v in c.graph.vertices()},
             components=[c.graph.vertices() for c in components],
@@ -245,11 +249,3 @@ def _known(teammate: Teammate) -> dict[str, int]:
     """Vertices in the frame of a robot, by the robot that made them."""
     assert teammate.name is not None
     return dict(Counter(v.robot for v in teammate.joint.component(teammate.name).graph.vertices()))
-
-
-def _trajectory(run: MemberRun, poses: Mapping[VertexId, gtsam.Pose2]) -> Trajectory:
-    joint = np.zeros((len(run.times), 3))
-    for index in np.unique(run.vertices):
-        inside = run.vertices == index
-        joint[inside] = se2.compose(array_of(poses[VertexId(run.robot, int(index))]), run.poses[inside])
-    return Trajectory(run.times, joint, run.vertices)

@@ -84,6 +84,7 @@ def sample_run(seed: int = 3) -> RunResult:
         seed=seed,
         trajectories=trajectories,
         local_maps=maps,
+        map_poses=vertex_poses,
         vertex_poses=vertex_poses,
         vertex_covariances=dict.fromkeys(vertex_poses, covariance),
         components=[[VertexId("green", 0)], [red0, red1, blue0, blue1]],

@@ -101,6 +101,7 @@ def a_run(measured: gtsam.Pose2, truth: FloatArray) -> RunResult:
         seed=0,
         trajectories={},
         local_maps={a: local([0, 1], np.zeros(3)), b: local([2, 3], np.array([0.1, 0.0, 0.0]))},
+        map_poses={},
         vertex_poses={a: gtsam.Pose2(1, 1, 1), b: gtsam.Pose2(1, 1, 1).compose(measured)},
         vertex_covariances={a: covariance, b: 4 * covariance},
         components=[[a, b]],

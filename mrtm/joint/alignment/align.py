@@ -42,6 +42,7 @@ class Alignment:
         agreement: of the two grids there.
         rival: the score of the best other place, as a fraction of this one's; 0 if there is none.
         innovation: chi2 of 3 degrees of freedom against the guess.
+        shares: (k,) of a's places and of b's, that what lies on each other was drawn from, as of ``Bends.shares``.
         refusal: why it should not be believed, with the number; None if accepted.
     """
 
@@ -51,6 +52,7 @@ class Alignment:
     agreement: Agreement
     rival: float
     innovation: float
+    shares: tuple[FloatArray, FloatArray]
     refusal: str | None
 
     @property
@@ -91,7 +93,7 @@ def align(a: Surface, b: Surface, guess: UncertainPose) -> Alignment | None:
     agreed = agreement(a.lookup, b.lookup, array_of(estimate.pose))
     _, moved = innovation(guess, estimate)
     refusal = _refusal(found, agreed, rival, moved)
-    return Alignment(estimate, found.pairs, found.residual, agreed, rival, moved, refusal)
+    return Alignment(estimate, found.pairs, found.residual, agreed, rival, moved, found.shares, refusal)
 
 
 def _places(a: Surface, b: Surface, guess: UncertainPose) -> FloatArray:

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 
 from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
+from frontend.records import FloatArray
 from mrtm.joint.alignment.align import Alignment, align
 from mrtm.joint.alignment.candidates import Candidate, pairs
 from mrtm.joint.alignment.surface import Surface
@@ -64,6 +65,10 @@ class Aligner:
     def edges(self) -> list[Edge]:
         """Those believed."""
         return [a.edge for a in self.attempts.values() if a.edge is not None]
+
+    def overlaps(self) -> dict[EdgeId, tuple[FloatArray, FloatArray]]:
+        """Of those believed, which places of their two maps they rest on: ``Alignment.shares``."""
+        return {a.edge.id: a.found.shares for a in self.attempts.values() if a.edge is not None and a.found is not None}
 
     def keep_within(self, groups: Iterable[Collection[str]]) -> None:
         """Forget alignments between robots that are not, or no longer, in one of the ``groups``.

@@ -33,19 +33,22 @@ class Fit:
         residual: rms distance of a point to its partner's line, metres.
         information: (3, 3) of the points alone, in the frame of b; singular along a corridor.
         drift: (3, 3) covariance that the bends of both maps add, in the frame of b.
+        shares: (k,) of a's places and of b's, that the points were drawn from, as of ``Bends.shares``.
     """
 
     pairs: int
     residual: float
     information: FloatArray
     drift: FloatArray
+    shares: tuple[FloatArray, FloatArray]
 
 
 def fit(a: Surface, b: Surface, a_T_b: FloatArray) -> Fit:
     """Measure how ``b`` lies on ``a`` at (3,) ``a_T_b``, an optimum."""
     in_a, in_b = partners(a, b, a_T_b, REACH)
     if len(in_b) == 0:
-        return Fit(0, np.inf, np.zeros((3, 3)), np.zeros((3, 3)))
+        nowhere = np.zeros(len(a.bends.places)), np.zeros(len(b.bends.places))
+        return Fit(0, np.inf, np.zeros((3, 3)), np.zeros((3, 3)), nowhere)
     b_T_a = se2.inverse(a_T_b)
     turn = rotation(b_T_a[2])
     points, lines = b.points[in_b], a.normals[in_a] @ turn.T
@@ -59,10 +62,11 @@ def fit(a: Surface, b: Surface, a_T_b: FloatArray) -> Fit:
     noise = np.array([[weights.sum(), 0.0, -y], [0.0, weights.sum(), x], [-y, x, square]])
     values, vectors = np.linalg.eigh(information - NORMAL_NOISE * noise)
     carried = se2.adjoint(b_T_a)
-    drift = _drift(b.bends, points) + carried @ _drift(a.bends, a.points[in_a]) @ carried.T
+    shares = _shares(a.bends, a.points[in_a]), _shares(b.bends, points)
+    drift = _drift(b.bends, shares[1]) + carried @ _drift(a.bends, shares[0]) @ carried.T
     drift[:2, :2] += FLOOR**2 * np.eye(2)
     residual = float(np.sqrt(np.mean(np.square(residuals))))
-    return Fit(len(points), residual, (vectors * np.maximum(values, 0.0)) @ vectors.T, drift)
+    return Fit(len(points), residual, (vectors * np.maximum(values, 0.0)) @ vectors.T, drift, shares)
 
 
 def _patches(points: FloatArray, normals: FloatArray) -> npt.NDArray[np.int64]:
@@ -84,9 +88,11 @@ def _weights(residuals: FloatArray, patch: npt.NDArray[np.int64]) -> FloatArray:
     return np.asarray(1.0 / (max(POINT**2, own) + count * max(COMMON**2, common)))[patch]
 
 
-def _drift(bends: Bends, points: FloatArray) -> FloatArray:
-    """(3, 3) covariance, in the map's frame, of what lies at (n, 2) ``points``, as a whole, against its origin."""
-    if not len(bends.places):
-        return np.zeros((3, 3))
-    shares = bends.shares(points[:: -(-len(points) // SAMPLE)]).mean(axis=0, keepdims=True)
-    return np.asarray(bends.errors(shares)[0])
+def _shares(bends: Bends, points: FloatArray) -> FloatArray:
+    """(k,) of a map's places that (n > 0, 2) ``points``, together, were drawn from."""
+    return np.asarray(bends.shares(points[:: -(-len(points) // SAMPLE)]).mean(axis=0))
+
+
+def _drift(bends: Bends, shares: FloatArray) -> FloatArray:
+    """(3, 3) covariance, in the map's frame, of what was drawn from ``shares`` of its places against its origin."""
+    return np.asarray(bends.errors(shares[None])[0]) if len(shares) else np.zeros((3, 3))

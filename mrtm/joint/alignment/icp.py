@@ -21,7 +21,7 @@ class Round(NamedTuple):
 
 
 COARSE = Round(0.5, 500), Round(0.3, 500), Round(0.15, 500)
-FINE = Round(0.15, 1500)
+FINE = Round(0.15, 10000)
 SCALE = 0.17  # metres, of the robust kernel (Geman and McClure)
 ITERATIONS = 15  # a round
 STILL = 1e-4  # metres and radians a step: the end of a round
