@@ -122,6 +122,7 @@ def test_an_alignment_that_the_estimate_contradicts_is_taken_back() -> None:
     joint, one = graph(), Aligner()
     one.look(joint, maps(), 12)
     (edge,) = one.edges()
+    assert one.overlaps().keys() == {edge.id}
     joint.update(add=[edge])
     assert one.take_back(joint) == []
     first = next(e for e in joint.edges() if e.kind is EdgeKind.FUSING)
@@ -131,6 +132,7 @@ def test_an_alignment_that_the_estimate_contradicts_is_taken_back() -> None:
     joint.update(add=more)
     assert one.take_back(joint) == [edge.id]
     assert one.edges() == []
+    assert one.overlaps() == {}
     assert not one.joins("red", "blue")
     assert "chi2" in one.attempts[PAIR].refusal
     assert one.take_back(joint) == []

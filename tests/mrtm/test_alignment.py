@@ -139,6 +139,8 @@ def test_a_map_that_is_unsure_of_its_parts_makes_the_alignment_so_there(room: tu
         bends = Bends(np.array([here, here + 40.0]), np.array([near, far]))
         found = fit(a, replace(b, bends=bends), TRUE)
         np.testing.assert_allclose(found.drift - firm.drift, expected, rtol=0.05, atol=1e-6)
+        assert [len(shares) for shares in found.shares] == [0, 2]
+        assert found.shares[1][0] > 0.95  # what was compared was drawn from about there
         turned = fit(replace(b, bends=bends), a, se2.inverse(TRUE))  # in the frame of the other
         back = pose_of(TRUE).AdjointMap()
         np.testing.assert_allclose(turned.drift - firm.drift, back @ expected @ back.T, rtol=0.1, atol=1e-5)

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -58,6 +59,22 @@ def test_run_json_tells_the_whole_story(out: Path) -> None:
     vertex = run["vertices"][0]
     assert vertex["first_scan"]["time"] == 100.0
     np.testing.assert_allclose(vertex["first_scan"]["pose"], 0, atol=1e-12)
+
+
+def test_maps_are_drawn_where_they_lie_as_a_whole(out: Path, tmp_path: Path) -> None:
+    """And vertices where the graph has them: their local maps may lie a little aside."""
+    result = sample_run()
+    aside = gtsam.Pose2(10.0, -5.0, 0.0)
+    export(replace(result, map_poses={v: aside.compose(pose) for v, pose in result.map_poses.items()}), tmp_path)
+    images = [np.asarray(Image.open(path / "map.pgm")) for path in (out, tmp_path)]
+    np.testing.assert_array_equal(*images)
+    origins = [yaml.safe_load((path / "map.yaml").read_text())["origin"] for path in (out, tmp_path)]
+    np.testing.assert_allclose(np.subtract(*origins[::-1]), [10.0, -5.0, 0.0], atol=1e-6)
+    before, after = (json.loads((path / "run.json").read_text())["vertices"] for path in (out, tmp_path))
+    for old, new in zip(before, after, strict=True):
+        assert new["pose"] == old["pose"]
+        np.testing.assert_allclose(np.subtract(new["map_pose"], old["map_pose"]), [10.0, -5.0, 0.0], atol=1e-9)
+    assert (tmp_path / "graph.g2o").read_bytes() == (out / "graph.g2o").read_bytes()
 
 
 def test_trajectories_keep_the_order_of_the_log_and_the_microseconds(tmp_path: Path) -> None:

@@ -14,10 +14,14 @@ import pytest
 import yaml
 from PIL import Image
 
+from factors import VertexId
 from frontend import se2
 from frontend.errors import LogError
+from frontend.records import FloatArray
 from mrtm.config import Config, load_config
 from mrtm.evaluation import evaluate_output, read_tum
+from mrtm.joint.crispness import crispness
+from mrtm.moving import moved
 from mrtm.result import RunResult
 from mrtm.session import run_session
 from tests.mrtm.small_logs import edge_errors, errors, false_edges, mapped, office_ring, poses, ring, room, small
@@ -112,6 +116,28 @@ def test_the_committed_demo_team_comes_into_one_map(demo: tuple[Path, RunResult]
     (ate,) = evaluation.ate
     assert ate.translation.rmse < 0.1
     assert ate.translation.max < 0.5
+
+
+def jumps(result: RunResult) -> FloatArray:
+    """(n,) metres by which the step from one vertex into the next differs from what the map that is left measured."""
+    found = []
+    for robot, trajectory in result.trajectories.items():
+        for scan in np.flatnonzero(np.diff(trajectory.vertices)):
+            left = result.local_maps[VertexId(robot, int(trajectory.vertices[scan]))]
+            places = np.searchsorted(left.scans, (scan, scan + 1))
+            if left.scans[-1] > scan and (left.scans[places] == (scan, scan + 1)).all():
+                found.append(se2.between(se2.between(*left.poses[places]), se2.between(*trajectory.poses[scan:][:2])))
+    return np.asarray(np.hypot(*np.array(found)[:, :2].T))
+
+
+def test_trajectories_do_not_jump_where_robots_go_from_map_to_map(demo: tuple[Path, RunResult]) -> None:
+    """Rigid maps would; and where they overlap they are drawn where they lie best as a whole."""
+    _, result = demo
+    rigid = moved(result, result.vertex_poses)
+    assert len(jumps(result)) > 8
+    assert jumps(result).mean() < 0.6 * jumps(rigid).mean()
+    (component,) = result.components
+    assert crispness(result.placed_maps(component)).entropy <= crispness(rigid.placed_maps(component)).entropy + 1e-3
 
 
 def test_the_story_of_the_demo_team_is_told(demo: tuple[Path, RunResult]) -> None:
