@@ -113,19 +113,18 @@ class _Unknowns:
         self.prior[:3] = float(root)  # nothing moves the root
         self._root = root
         mixing = np.linalg.cholesky(bends.together() + 1e-9 * np.eye(k))
-        self._mixing = np.einsum("ij,iab->iajb", mixing, bends.roots()).reshape(3 * k, 3 * k)
+        self._mixing = np.einsum("ij,iab->iajb", mixing, bends.roots())
 
     def motion(self, shares: FloatArray | None) -> FloatArray:
         """(3, 3 + 3 k) derivative of the motion of what was drawn from the places in ``shares``."""
         origin = np.zeros((3, 3)) if self._root else np.eye(3)
-        if shares is None:
-            return np.concatenate([origin, np.zeros((3, len(self._mixing)))], axis=1)
-        return np.concatenate([origin, np.kron(shares, np.eye(3)) @ self._mixing], axis=1)
+        at = np.zeros(len(self.bends.places)) if shares is None else shares
+        return np.concatenate([origin, np.einsum("i,iajb->ajb", at, self._mixing).reshape(3, -1)], axis=1)
 
     def solved(self, pose: gtsam.Pose2, solution: FloatArray) -> BentMap:
         mine = solution[self.columns]
         origin = pose.compose(gtsam.Pose2.Expmap(mine[:3]))
-        return BentMap(origin, self.bends, (self._mixing @ mine[3:]).reshape(-1, 3))
+        return BentMap(origin, self.bends, np.einsum("iajb,jb->ia", self._mixing, mine[3:].reshape(-1, 3)))
 
 
 def _equations(

@@ -69,7 +69,7 @@ def test_scans_follow_as_far_as_their_way_when_a_loop_closes() -> None:
     assert 0.09 < placed[-1, 1] < 0.12
     assert (np.diff(placed[:, 1]) > 0.0).all()
     assert found[A].rigid(WAY).y() == pytest.approx(placed[:, 1].mean(), abs=1e-4)
-    assert found[A].origin.equals(gtsam.Pose2(), 0.0)
+    assert found[A].origin.equals(gtsam.Pose2(), 1e-12)
     assert found[B].origin.equals(loop.measurement, 1e-4)
 
 

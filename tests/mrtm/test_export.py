@@ -66,8 +66,7 @@ def test_maps_are_drawn_where_they_lie_as_a_whole(out: Path, tmp_path: Path) -> 
     result = sample_run()
     aside = gtsam.Pose2(10.0, -5.0, 0.0)
     export(replace(result, map_poses={v: aside.compose(pose) for v, pose in result.map_poses.items()}), tmp_path)
-    images = [np.asarray(Image.open(path / "map.pgm")) for path in (out, tmp_path)]
-    np.testing.assert_array_equal(*images)
+    assert (tmp_path / "map.pgm").read_bytes() == (out / "map.pgm").read_bytes()
     origins = [yaml.safe_load((path / "map.yaml").read_text())["origin"] for path in (out, tmp_path)]
     np.testing.assert_allclose(np.subtract(*origins[::-1]), [10.0, -5.0, 0.0], atol=1e-6)
     before, after = (json.loads((path / "run.json").read_text())["vertices"] for path in (out, tmp_path))
