@@ -15,8 +15,6 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from scipy.sparse import csc_array, diags_array
-from scipy.sparse.linalg import splu
 
 from factors import GraphEdge, VertexId, factor_of, has_kernel, weight
 from frontend import se2
@@ -78,74 +76,66 @@ def bend(
         holdings: the edges that are believed, all between these vertices.
         bends: of the maps; a vertex without does not bend.
     """
-    unknowns, count = {}, 0
-    for vertex in poses:
-        unknowns[vertex] = _Unknowns(bends.get(vertex, Bends()), count, root=not count)
-        count += len(unknowns[vertex].prior)
-    equations = [_equations(h, poses, unknowns[h.edge.tail], unknowns[h.edge.head]) for h in holdings]
-    prior = np.concatenate([u.prior for u in unknowns.values()])
-    solution = np.zeros(count)
-    if equations:
-        blocks, right, columns = zip(*equations, strict=True)
-        ends = np.cumsum([0, *map(len, blocks)])
-        rows = [np.repeat(np.arange(end - len(b), end), b.shape[1]) for end, b in zip(ends[1:], blocks, strict=True)]
-        indices = [np.tile(c, len(b)) for c, b in zip(columns, blocks, strict=True)]
-        entries = np.concatenate([b.ravel() for b in blocks])
-        jacobian = csc_array((entries, (np.concatenate(rows), np.concatenate(indices))), shape=(ends[-1], count))
-        normal = jacobian.T @ jacobian + diags_array(prior)
-        solution = splu(normal.tocsc()).solve(jacobian.T @ np.concatenate(right))
-    return {vertex: u.solved(poses[vertex], solution) for vertex, u in unknowns.items()}
+    unknowns = {vertex: _Unknowns(key, bends.get(vertex, Bends())) for key, vertex in enumerate(poses)}
+    equations = gtsam.GaussianFactorGraph()
+    for one in unknowns.values():
+        equations.add(one.prior())
+    for holding in holdings:
+        equations.add(_equation(holding, poses, unknowns[holding.edge.tail], unknowns[holding.edge.head]))
+    solution = equations.optimize()
+    return {vertex: one.solved(poses[vertex], solution) for vertex, one in unknowns.items()}
 
 
 class _Unknowns:
-    """Of one map: the motion of its origin, and three for each of its places, of unit variance, that its bends come of.
+    """Of one map: the motion of its origin, and three of unit variance for each of its places, that its bends come of.
 
     Attributes:
-        columns: (3 + 3 k,) their numbers.
-        prior: (3 + 3 k,) their information.
+        key: their name; 0 for the root's.
     """
 
-    def __init__(self, bends: Bends, first: int, root: bool) -> None:
-        self.bends = bends
-        k = len(bends.places)
-        self.columns = first + np.arange(3 + 3 * k)
-        self.prior = np.ones(3 + 3 * k)
-        self.prior[:3] = float(root)  # nothing moves the root
-        self._root = root
-        mixing = np.linalg.cholesky(bends.together() + 1e-9 * np.eye(k))
+    def __init__(self, key: int, bends: Bends) -> None:
+        self.key = key
+        self._bends = bends
+        mixing = np.linalg.cholesky(bends.together() + 1e-9 * np.eye(len(bends.places)))
         self._mixing = np.einsum("ij,iab->iajb", mixing, bends.roots())
 
-    def motion(self, shares: FloatArray | None) -> FloatArray:
-        """(3, 3 + 3 k) derivative of the motion of what was drawn from the places in ``shares``."""
-        origin = np.zeros((3, 3)) if self._root else np.eye(3)
-        at = np.zeros(len(self.bends.places)) if shares is None else shares
-        return np.concatenate([origin, np.einsum("i,iajb->ajb", at, self._mixing).reshape(3, -1)], axis=1)
+    def prior(self) -> gtsam.JacobianFactor:
+        """Nothing is known of the motion of an origin; the root has none."""
+        known = np.eye(3 + 3 * len(self._bends.places))
+        known[:3] *= 1e6 if self.key == 0 else 0.0
+        return gtsam.JacobianFactor(self.key, known, np.zeros(len(known)), gtsam.noiseModel.Unit.Create(len(known)))
 
-    def solved(self, pose: gtsam.Pose2, solution: FloatArray) -> BentMap:
-        mine = solution[self.columns]
-        origin = pose.compose(gtsam.Pose2.Expmap(mine[:3]))
-        return BentMap(origin, self.bends, np.einsum("iajb,jb->ia", self._mixing, mine[3:].reshape(-1, 3)))
+    def bent(self, shares: FloatArray | None) -> FloatArray:
+        """(3, 3 k) derivative of how what was drawn from the places in ``shares`` moves against the origin."""
+        at = np.zeros(len(self._bends.places)) if shares is None else shares
+        return np.asarray(np.einsum("i,iajb->ajb", at, self._mixing).reshape(3, -1))
+
+    def solved(self, pose: gtsam.Pose2, solution: gtsam.VectorValues) -> BentMap:
+        """The map at the solution of the equations."""
+        mine = solution.at(self.key)
+        motions = np.einsum("iajb,jb->ia", self._mixing, mine[3:].reshape(-1, 3))
+        return BentMap(pose.compose(gtsam.Pose2.Expmap(mine[:3])), self._bends, motions)
 
 
-def _equations(
+def _equation(
     holding: Holding, poses: Mapping[VertexId, gtsam.Pose2], tail: _Unknowns, head: _Unknowns
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What an edge says of the unknowns of its two maps: (n, m) coefficients and (n,) right side, of unit noise, and
-    the (m,) numbers of the unknowns."""
+) -> gtsam.JacobianFactor:
+    """What an edge says of the unknowns of its two maps."""
     edge = holding.edge
     relative = poses[edge.tail].between(poses[edge.head])
     residual, by_head = edge.residual(relative)
     by_tail = -by_head @ relative.inverse().AdjointMap()
-    coefficients = np.concatenate([by_tail @ tail.motion(holding.tail), by_head @ head.motion(holding.head)], axis=1)
-    columns = np.concatenate([tail.columns, head.columns])
-    bending = np.concatenate([np.arange(len(u.columns)) >= 3 for u in (tail, head)])
+    by_bends = by_tail @ tail.bent(holding.tail), by_head @ head.bent(holding.head)
     # The covariance without the bends' part of it, in the metric in which it is the unit matrix.
     whiten = np.linalg.inv(np.linalg.cholesky(edge.covariance))
-    bent = whiten @ coefficients[:, bending]
-    share, axes = np.linalg.eigh(bent @ bent.T)
+    share, axes = np.linalg.eigh(whiten @ sum(by @ by.T for by in by_bends) @ whiten.T)
     own = np.maximum(1.0 - share, LEAST) / _kernel_weight(edge, poses)
     whiten = (axes / np.sqrt(own)).T @ whiten
-    return whiten @ coefficients, -whiten @ residual, columns
+    of_tail, of_head = (
+        whiten @ np.concatenate(both, axis=1) for both in zip((by_tail, by_head), by_bends, strict=True)
+    )
+    unit = gtsam.noiseModel.Unit.Create(len(residual))
+    return gtsam.JacobianFactor(tail.key, of_tail, head.key, of_head, -whiten @ residual, unit)
 
 
 def _kernel_weight(edge: GraphEdge, poses: Mapping[VertexId, gtsam.Pose2]) -> float:
