@@ -62,19 +62,20 @@ def _crossings(
     """Where robots went from one vertex's map into another's, or back: shares of the places of each."""
     found: dict[tuple[VertexId, VertexId], list[tuple[FloatArray, FloatArray]]] = {}
     for run in runs:
-        for scan in np.flatnonzero(np.diff(run.vertices)):
-            ends = [VertexId(run.robot, int(run.vertices[at])) for at in (scan, scan + 1)]
-            if {*ends} <= maps.keys():
-                old, new = (
-                    maps[v].bends.shares(run.poses[at : at + 1, :2])[0]
-                    for v, at in zip(ends, (scan, scan + 1), strict=True)
-                )
-                found.setdefault((ends[0], ends[1]), []).append((old, new))
-                found.setdefault((ends[1], ends[0]), []).append((new, old))
-    return {
-        ends: (_mean(tails), _mean(heads)) for ends, both in found.items() for tails, heads in [zip(*both, strict=True)]
-    }
+        for scan in np.flatnonzero(np.diff(run.vertices)).tolist():
+            old, new = (VertexId(run.robot, int(run.vertices[at])) for at in (scan, scan + 1))
+            if {old, new} <= maps.keys():
+                shares = _shares(maps[old], run, scan), _shares(maps[new], run, scan + 1)
+                found.setdefault((old, new), []).append(shares)
+                found.setdefault((new, old), []).append(shares[::-1])
+    return {ends: (_mean(both, 0), _mean(both, 1)) for ends, both in found.items()}
 
 
-def _mean(shares: Sequence[FloatArray]) -> FloatArray:
-    return np.asarray(np.mean(shares, axis=0))
+def _shares(local_map: LocalMap, run: MemberRun, scan: int) -> FloatArray:
+    if scan == local_map.scans[0]:  # M7: a vertex is made where the robot is, and is sure there
+        return np.zeros(len(local_map.bends.places))
+    return np.asarray(local_map.bends.shares(run.poses[scan : scan + 1, :2])[0])
+
+
+def _mean(both: Sequence[tuple[FloatArray, FloatArray]], end: int) -> FloatArray:
+    return np.asarray(np.mean([shares[end] for shares in both], axis=0))
