@@ -26,8 +26,10 @@ def local_map(first: int) -> LocalMap:
     """A scan a metre; the last of the first map is the second's first."""
     none = np.empty((0, 2))
     bends = Bends(WAY[::2, :2], WAY[::2, :1, None] * DRIFT)
-    scans = first + np.arange(len(WAY))
-    return LocalMap(Grid(np.zeros((1, 1), np.float32), 0.05, np.zeros(2)), scans, 1.0 * scans, WAY, none, none, bends)
+    scans = first + np.arange(len(WAY), dtype=np.int64)
+    return LocalMap(
+        Grid(np.zeros((1, 1), np.float32), 0.05, np.zeros(2)), scans, scans.astype(np.float64), WAY, none, none, bends
+    )
 
 
 @pytest.fixture
