@@ -80,6 +80,19 @@ class Bends:
         apart = np.linalg.norm(self.places[:, None] - self.places, axis=-1)
         return np.asarray(0.5 * (way[:, None] + way - apart) / np.sqrt(way[:, None] * way))
 
+    def following(self, points: FloatArray) -> FloatArray:
+        """(n, k) by how much what lies at (n, 2) ``points`` is expected to move with each place: none at the origin.
+
+        The mean of that Brownian motion, given what it is at the places.
+        """
+        whole = self._common(self.places) + 1e-6 * np.eye(len(self.places))
+        return np.asarray(np.linalg.solve(whole, self._common(points).T).T)
+
+    def _common(self, points: FloatArray) -> FloatArray:
+        """(n, k) metres that the ways to (n, 2) ``points`` and to the places have in common."""
+        ways = np.linalg.norm(points, axis=1)[:, None] + np.linalg.norm(self.places, axis=1)
+        return np.asarray(0.5 * (ways - np.linalg.norm(points[:, None] - self.places, axis=-1)))
+
 
 @dataclass(frozen=True, slots=True)
 class LocalMap:

@@ -15,6 +15,9 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csc_array, diags_array
+from scipy.sparse.linalg import splu
 
 from factors import GraphEdge, VertexId, factor_of, has_kernel, weight
 from frontend import se2
@@ -22,15 +25,17 @@ from frontend.local_map import Bends
 from frontend.records import FloatArray
 from mrtm.robot.poses import array_of
 
+IntArray = npt.NDArray[np.int64]
+
 LEAST = 0.3
 """Share of an edge's covariance that is not of bends, at least: these are known of squares of some metres only. On
 simulated teams 0.1 to 0.5 come to nearly the same."""
 
 
 class Holding(NamedTuple):
-    """An edge, and where it holds: (k,) shares, as of ``Bends.shares``, in the places of its tail's and its head's map.
+    """An edge, and where it holds: (k,) by how much that moves with each place of its tail's and of its head's map.
 
-    None is at the origin.
+    Such as of ``Bends.shares`` or ``Bends.following``; None is at the origin.
     """
 
     edge: GraphEdge
@@ -63,7 +68,7 @@ class BentMap:
     def _motions(self, poses: FloatArray) -> FloatArray:
         if not len(self.motions):
             return np.zeros((len(poses), 3))
-        return np.asarray(self.bends.shares(poses[:, :2]) @ self.motions)
+        return np.asarray(self.bends.following(poses[:, :2]) @ self.motions)
 
 
 def bend(
@@ -76,13 +81,23 @@ def bend(
         holdings: the edges that are believed, all between these vertices.
         bends: of the maps; a vertex without does not bend.
     """
-    unknowns = {vertex: _Unknowns(key, bends.get(vertex, Bends())) for key, vertex in enumerate(poses)}
-    equations = gtsam.GaussianFactorGraph()
-    for one in unknowns.values():
-        equations.add(one.prior())
-    for holding in holdings:
-        equations.add(_equation(holding, poses, unknowns[holding.edge.tail], unknowns[holding.edge.head]))
-    solution = equations.optimize()
+    unknowns: dict[VertexId, _Unknowns] = {}
+    count = 0
+    for vertex in poses:
+        unknowns[vertex] = _Unknowns(count, bends.get(vertex, Bends()))
+        count += len(unknowns[vertex].prior)
+    normal, right = diags_array(np.concatenate([one.prior for one in unknowns.values()])).tocsc(), np.zeros(count)
+    if holdings:
+        equations = [_equation(h, poses, unknowns[h.edge.tail], unknowns[h.edge.head]) for h in holdings]
+        blocks, residuals, columns = zip(*equations, strict=True)
+        rows = np.split(np.arange(sum(map(len, blocks))), np.cumsum([len(block) for block in blocks])[:-1])
+        row = np.concatenate([np.repeat(r, len(c)) for r, c in zip(rows, columns, strict=True)])
+        column = np.concatenate([np.tile(c, len(r)) for r, c in zip(rows, columns, strict=True)])
+        jacobian = csc_array((np.concatenate([b.ravel() for b in blocks]), (row, column)), (row[-1] + 1, count))
+        normal, right = (normal + jacobian.T @ jacobian).tocsc(), -(jacobian.T @ np.concatenate(residuals))
+    # GTSAM's elimination takes a robot that is almost lost against its past for one that is not connected.
+    solver = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    solution = solver.solve(right)
     return {vertex: one.solved(poses[vertex], solution) for vertex, one in unknowns.items()}
 
 
@@ -90,37 +105,37 @@ class _Unknowns:
     """Of one map: the motion of its origin, and three of unit variance for each of its places, that its bends come of.
 
     Attributes:
-        key: their name; 0 for the root's.
+        columns: (3 + 3 k,) their numbers, from 0 for the root's on.
+        prior: (3 + 3 k,) the information on them: none on the motion of origins. The root's is 0; edges only move origins
+            against each other.
     """
 
-    def __init__(self, key: int, bends: Bends) -> None:
-        self.key = key
+    def __init__(self, first: int, bends: Bends) -> None:
         self._bends = bends
-        mixing = np.linalg.cholesky(bends.together() + 1e-9 * np.eye(len(bends.places)))
+        k = len(bends.places)
+        self.columns = first + np.arange(3 + 3 * k)
+        self.prior = np.ones(3 + 3 * k)
+        self.prior[:3] = 0.0 if first else 1.0
+        mixing = np.linalg.cholesky(bends.together() + 1e-9 * np.eye(k))
         self._mixing = np.einsum("ij,iab->iajb", mixing, bends.roots())
 
-    def prior(self) -> gtsam.JacobianFactor:
-        """Nothing is known of the motion of an origin; the root has none."""
-        known = np.eye(3 + 3 * len(self._bends.places))
-        known[:3] *= 1e6 if self.key == 0 else 0.0
-        return gtsam.JacobianFactor(self.key, known, np.zeros(len(known)), gtsam.noiseModel.Unit.Create(len(known)))
-
-    def bent(self, shares: FloatArray | None) -> FloatArray:
-        """(3, 3 k) derivative of how what was drawn from the places in ``shares`` moves against the origin."""
-        at = np.zeros(len(self._bends.places)) if shares is None else shares
+    def bent(self, where: FloatArray | None) -> FloatArray:
+        """(3, 3 k) derivative of how an edge's place, as in ``Holding``, moves against the origin."""
+        at = np.zeros(len(self._bends.places)) if where is None else where
         return np.asarray(np.einsum("i,iajb->ajb", at, self._mixing).reshape(3, -1))
 
-    def solved(self, pose: gtsam.Pose2, solution: gtsam.VectorValues) -> BentMap:
+    def solved(self, pose: gtsam.Pose2, solution: FloatArray) -> BentMap:
         """The map at the solution of the equations."""
-        mine = solution.at(self.key)
+        mine = solution[self.columns]
         motions = np.einsum("iajb,jb->ia", self._mixing, mine[3:].reshape(-1, 3))
         return BentMap(pose.compose(gtsam.Pose2.Expmap(mine[:3])), self._bends, motions)
 
 
 def _equation(
     holding: Holding, poses: Mapping[VertexId, gtsam.Pose2], tail: _Unknowns, head: _Unknowns
-) -> gtsam.JacobianFactor:
-    """What an edge says of the unknowns of its two maps."""
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """What an edge says of the unknowns of its two maps: (n, m) coefficients and (n,) residuals of unit noise, and the
+    (m,) numbers of the unknowns."""
     edge = holding.edge
     relative = poses[edge.tail].between(poses[edge.head])
     residual, by_head = edge.residual(relative)
@@ -134,8 +149,7 @@ def _equation(
     of_tail, of_head = (
         whiten @ np.concatenate(both, axis=1) for both in zip((by_tail, by_head), by_bends, strict=True)
     )
-    unit = gtsam.noiseModel.Unit.Create(len(residual))
-    return gtsam.JacobianFactor(tail.key, of_tail, head.key, of_head, -whiten @ residual, unit)
+    return np.concatenate([of_tail, of_head], axis=1), whiten @ residual, np.concatenate([tail.columns, head.columns])
 
 
 def _kernel_weight(edge: GraphEdge, poses: Mapping[VertexId, gtsam.Pose2]) -> float:

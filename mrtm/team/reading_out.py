@@ -59,23 +59,20 @@ def map_poses(maps: Mapping[VertexId, BentMap], local_maps: Mapping[VertexId, Lo
 def _crossings(
     runs: Sequence[MemberRun], maps: Mapping[VertexId, LocalMap]
 ) -> dict[tuple[VertexId, VertexId], tuple[FloatArray, FloatArray]]:
-    """Where robots went from one vertex's map into another's, or back: shares of the places of each."""
+    """Where robots went from one vertex's map into another's, or back: how that moves with the places of each."""
     found: dict[tuple[VertexId, VertexId], list[tuple[FloatArray, FloatArray]]] = {}
     for run in runs:
         for scan in np.flatnonzero(np.diff(run.vertices)).tolist():
             old, new = (VertexId(run.robot, int(run.vertices[at])) for at in (scan, scan + 1))
             if {old, new} <= maps.keys():
-                shares = _shares(maps[old], run, scan), _shares(maps[new], run, scan + 1)
-                found.setdefault((old, new), []).append(shares)
-                found.setdefault((new, old), []).append(shares[::-1])
+                at_old, at_new = (
+                    maps[vertex].bends.following(run.poses[at : at + 1, :2])[0]
+                    for vertex, at in ((old, scan), (new, scan + 1))
+                )
+                found.setdefault((old, new), []).append((at_old, at_new))
+                found.setdefault((new, old), []).append((at_new, at_old))
     return {ends: (_mean(both, 0), _mean(both, 1)) for ends, both in found.items()}
 
 
-def _shares(local_map: LocalMap, run: MemberRun, scan: int) -> FloatArray:
-    if scan == local_map.scans[0]:  # M7: a vertex is made where the robot is, and is sure there
-        return np.zeros(len(local_map.bends.places))
-    return np.asarray(local_map.bends.shares(run.poses[scan : scan + 1, :2])[0])
-
-
 def _mean(both: Sequence[tuple[FloatArray, FloatArray]], end: int) -> FloatArray:
-    return np.asarray(np.mean([shares[end] for shares in both], axis=0))
+    return np.asarray(np.mean([ends[end] for ends in both], axis=0))

