@@ -106,8 +106,8 @@ class _Unknowns:
 
     Attributes:
         columns: (3 + 3 k,) their numbers, from 0 for the root's on.
-        prior: (3 + 3 k,) the information on them: none on the motion of origins. The root's is 0; edges only move origins
-            against each other.
+        prior: (3 + 3 k,) the information on them: none on the motion of origins. The root has none, and needs little to
+            stay, as edges only move origins against each other.
     """
 
     def __init__(self, first: int, bends: Bends) -> None:
