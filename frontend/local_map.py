@@ -76,9 +76,11 @@ class Bends:
         Errors gather on the way from the origin, and those of two places go together as far as their ways do: as in
         Brownian motion of several parameters (P. Levy, "Processus stochastiques et mouvement brownien", 1948).
         """
-        way = np.maximum(np.linalg.norm(self.places, axis=1), 1e-6)
-        apart = np.linalg.norm(self.places[:, None] - self.places, axis=-1)
-        return np.asarray(0.5 * (way[:, None] + way - apart) / np.sqrt(way[:, None] * way))
+        common = self._common(self.places)
+        way = np.maximum(np.diagonal(common), 1e-6)
+        together = common / np.sqrt(way[:, None] * way)
+        np.fill_diagonal(together, 1.0)
+        return np.asarray(together)
 
     def following(self, points: FloatArray) -> FloatArray:
         """(n, k) by how much what lies at (n, 2) ``points`` is expected to move with each place: none at the origin.

@@ -80,7 +80,7 @@ class Equations:
     def doubt(self, ids: Collection[EdgeId]) -> None:
         """Take edges out of the equations."""
         self._smoother.update({}, gtsam.Values(), ids)
-        self._smoother.settle()
+        self._smoother.come_to_rest()
         self.doubted.update({i: self.misfit(self.edges[i]) for i in ids})
 
     def _factor(self, edge_id: EdgeId, kernel: bool) -> gtsam.NoiseModelFactor:

@@ -186,7 +186,7 @@ def _invert(starts, rows, diagonal, below, found_diagonal, found_below):  # type
                 while rows[at] != rows[p]:
                     at += 1
                 _add(found_below[at], below[q], sums[p - first])
-                _add_turned(found_below[at], below[p], sums[q - first])
+                _add(found_below[at].T, below[p], sums[q - first])
         found_diagonal[j] = diagonal[j]
         for p in range(first, end):
             found_below[p] = -sums[p - first]
@@ -252,17 +252,6 @@ def multiply(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def multiply_turned(a, b, out):  # type: ignore[no-untyped-def]
-    """``out`` = a' b."""
-    b00, b01, b02, b10, b11, b12, b20, b21, b22 = _entries(b)
-    for r in range(3):
-        x, y, z = a[0, r], a[1, r], a[2, r]
-        out[r, 0] = x * b00 + y * b10 + z * b20
-        out[r, 1] = x * b01 + y * b11 + z * b21
-        out[r, 2] = x * b02 + y * b12 + z * b22
-
-
-@njit(cache=True)
 def _subtract(a, b, out):  # type: ignore[no-untyped-def]
     """``out`` -= a b'."""
     b00, b01, b02, b10, b11, b12, b20, b21, b22 = _entries(b)
@@ -279,17 +268,6 @@ def _add(a, b, out):  # type: ignore[no-untyped-def]
     b00, b01, b02, b10, b11, b12, b20, b21, b22 = _entries(b)
     for r in range(3):
         x, y, z = a[r, 0], a[r, 1], a[r, 2]
-        out[r, 0] += x * b00 + y * b10 + z * b20
-        out[r, 1] += x * b01 + y * b11 + z * b21
-        out[r, 2] += x * b02 + y * b12 + z * b22
-
-
-@njit(cache=True)
-def _add_turned(a, b, out):  # type: ignore[no-untyped-def]
-    """``out`` += a' b."""
-    b00, b01, b02, b10, b11, b12, b20, b21, b22 = _entries(b)
-    for r in range(3):
-        x, y, z = a[0, r], a[1, r], a[2, r]
         out[r, 0] += x * b00 + y * b10 + z * b20
         out[r, 1] += x * b01 + y * b11 + z * b21
         out[r, 2] += x * b02 + y * b12 + z * b22

@@ -18,7 +18,6 @@ from mrtm.joint.sightings.block_cholesky import (
     factorise,
     inverse_of_factors,
     multiply,
-    multiply_turned,
     pattern_of,
     slot,
     substitute,
@@ -160,7 +159,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
             else:
                 j = e - split
                 innovation(full[j], measured[j], tail_anchor[j], head_anchor[j], predicted, pose, r, h)
-                multiply_turned(h, weights[j], mixed)
+                multiply(h.T, weights[j], mixed)
                 multiply(mixed, h, information)
                 _times(mixed, r, g)
             # A step of the head counts as it is, one of the tail as seen from the head.
@@ -170,7 +169,7 @@ def _gauss_newton(  # type: ignore[no-untyped-def]
                 diagonal[place[head]] += information
                 vector[place[head]] += g
             if tail >= 0:
-                multiply_turned(back, information, mixed)
+                multiply(back.T, information, mixed)
                 multiply(mixed, back, h)
                 diagonal[place[tail]] += h
                 for a in range(3):
