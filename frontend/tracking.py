@@ -100,8 +100,10 @@ class Tracker:
         else:
             mirrored, mirrored_merit = self._follow(layers, points, self._mirror, increment * OPPOSITE, added)
             self._mirror, self._mirror_motion = mirrored.pose, se2.compose(self._mirror_motion, increment * OPPOSITE)
-            # One scan proves little: its time may be off by a good part of the way driven. Nor does a bare corridor.
-            evidence = _grip(step, increment) * (mirrored_merit - merit)
+            # One scan proves little: its time may be off by a good part of the way driven. Nor does a bare corridor, or
+            # what of a scan lies in known space where that ends.
+            comparable = min(step.known, mirrored.known)
+            evidence = comparable * _grip(step, increment) * (mirrored_merit - merit)
             self.doubt = max(0.0, self.doubt + min(evidence, REVERSED / REVERSED_SCANS))
             # A wrong sign is the exception: it is held only as long as the scans go on saying so.
             held = self._sign[0] < 0.0 and evidence > -1.0
