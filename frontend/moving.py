@@ -72,8 +72,8 @@ def _against(hits, sensor, pose, image, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _moving(hits, sensor, image, old_hits, old_image, pose, out):  # type: ignore[no-untyped-def]
-    """Mark the endpoints of a scan that moved since an old one, taken at ``pose`` (3,) in its frame. How many."""
+def _moving(hits, sensor, image, old_hits, old_image, pose, within, out):  # type: ignore[no-untyped-def]
+    """Mark the endpoints ``within`` metres that moved since an old scan at ``pose`` (3,) in its frame. How many."""
     back = np.empty(3)
     c = math.cos(pose[2])
     s = math.sin(pose[2])
@@ -99,6 +99,7 @@ def _moving(hits, sensor, image, old_hits, old_image, pose, out):  # type: ignor
                 dy = hits[i, 1] - pose[1]
                 b = _bin(c * dx + s * dy - sensor[0], c * dy - s * dx - sensor[1])
                 moved = max(gone[b - 1], gone[b], gone[(b + 1) % BINS]) == 1
+            moved = moved and math.hypot(hits[i, 0] - sensor[0], hits[i, 1] - sensor[1]) < within
             out[i] = False
         if moved:
             run += 1
@@ -124,13 +125,16 @@ class Movers:
             self._kept.clear()
             self._compare(points)
 
-    def standing(self, points: Points, motion: FloatArray) -> Points:
-        """What of a scan taken ``motion`` (3,) after the last one stands still, as far as can be told."""
+    def standing(self, points: Points, motion: FloatArray, within: float = math.inf) -> Points:
+        """What of a scan taken ``motion`` (3,) after the last one stands still, as far as can be told.
+
+        Only what is ``within`` metres of the sensor is taken to move.
+        """
         self._pose = se2.compose(self._pose, motion)
         self._way += math.hypot(motion[0], motion[1])
-        return self._compare(points)
+        return self._compare(points, within)
 
-    def _compare(self, points: Points) -> Points:
+    def _compare(self, points: Points, within: float = math.inf) -> Points:
         image = np.zeros(BINS)
         _see(points.hits, points.sensor, image)
         _see(points.clear, points.sensor, image)
@@ -141,7 +145,7 @@ class Movers:
             old, old_image, pose, _ = self._kept[0]
             moving = np.empty(len(points.hits), np.bool_)
             at = se2.between(self._pose, pose)
-            count = _moving(points.hits, points.sensor, image, old.hits, old_image, at, moving)
+            count = _moving(points.hits, points.sensor, image, old.hits, old_image, at, within, moving)
             if 0 < count <= MOST * len(points.hits):
                 result = replace(points, hits=points.hits[~moving])
         if not self._kept or self._way - self._kept[-1][3] >= SPACING:

@@ -19,6 +19,7 @@ from frontend.records import FloatArray
 MIN_POINTS = 10  # fewer endpoints than this say nothing
 GOOD_FIT = 0.75  # a match that explains less than this of the known space, or
 GOOD_KNOWN = 0.25  # that has less than this in known space, is searched around
+CLOSE = 1.5  # metres within which a body can hide so much that all else fits badly
 LOST_FIT = 0.45  # below this also far around
 MARGIN = 0.05  # by how much a searched match must beat the plain one
 OPPOSITE = np.array([-1.0, -1.0, 1.0])
@@ -116,13 +117,18 @@ class Tracker:
                 step = mirrored
         if len(points.hits) >= MIN_POINTS and not _good(step):
             step = self._search(layers, points, se2.compose(self.pose, increment), increment, step)
-        if _good(step) and not step.searched and not turned_over:
-            standing = self.movers.standing(points, se2.between(self.pose, step.pose))
+        if not step.searched and not turned_over:
+            # Where the whole scan fits badly, a body close by may be why. If it still does without it, it is the path
+            # that is wrong, and the walls seem to move.
+            good = _good(step)
+            standing = self.movers.standing(points, se2.between(self.pose, step.pose), math.inf if good else CLOSE)
             if standing is not points:
                 prior, information = se2.compose(self.pose, increment), np.diag(1.0 / added)
-                again = self._match(layers, standing, step.pose, prior, information)
-                # Whether this is the place the whole scan says: on a wrong path it is the walls that seem to move.
-                step.pose, step.hessian, step.points = again.pose, again.hessian, standing
+                again = self._match(layers, standing, step.pose.copy(), prior, information)
+                if good or _good(again):
+                    step.pose, step.hessian, step.points = again.pose, again.hessian, standing
+                else:
+                    self.movers.start(points)
         else:
             self.movers.start(points)
         step.reversed, step.forward = turned_over, bool(self._sign[0] > 0.0)

@@ -4,10 +4,13 @@ import numpy as np
 import numpy.typing as npt
 
 from frontend import se2
+from frontend.local_slam import LocalSlam
 from frontend.moving import BACK, Movers
+from frontend.parameters import FilterParameters
 from frontend.points import Points, points_of
 from frontend.records import FloatArray
 from tests.frontend.simulated import CORRIDOR, drive, scan_of
+from tools.simulation import FloorPlan
 from tools.simulation.laser import LMS200, measure
 
 STEP = 0.14  # metres between two scans
@@ -69,3 +72,36 @@ def test_a_path_that_begins_anew_has_nothing_to_compare_with() -> None:
     assert movers.standing(points[6], se2.between(poses[5], poses[6])) is not points[6]
     movers.start(points[6])
     assert movers.standing(points[7], se2.between(poses[6], poses[7])) is points[7]
+
+
+def test_only_what_is_near_enough_is_taken_to_move() -> None:
+    poses, points, bodies = led(20, STEP, 1.5)
+    motion = se2.between(poses[-2], poses[-1])
+    for within, moves in ((1.0, False), (2.5, True)):
+        movers = Movers()
+        movers.start(points[0])
+        for i in range(1, 19):
+            movers.standing(points[i], se2.between(poses[i - 1], poses[i]))
+        left = len(points[-1].hits) - len(movers.standing(points[-1], motion, within).hits)
+        assert bodies[-1].any()
+        assert (left > 0) == moves
+
+
+def test_a_body_that_fills_much_of_the_view_stays_out_of_the_map() -> None:
+    step, steps, width = 0.25, 32, 34.0
+    doors = [(x, y, x + 2.2, y) for x in np.arange(-12.0, 30.0, 3.0) for y in (-1.1, 1.1)]
+    rooms = [(-12.0, -5.0, 30.0, -5.0), (-12.0, 5.0, 30.0, 5.0)]
+    plan = FloorPlan("doors", [*doors, *rooms])
+    poses = np.zeros((steps, 3))
+    poses[:, 0] = step * np.arange(steps)
+    # The other is behind at first, then comes from the side and drives as fast as we do, a hand's breadth ahead.
+    away = np.where(np.arange(steps) < 6, -3.0, 0.5)
+    others = np.column_stack((poses[:, 0] + away, np.zeros(steps)))[:, None, :]
+    ranges = measure(LMS200, plan.segments, poses, np.random.default_rng(3), others)
+    points = [points_of(scan_of(r), 25.0, 181) for r in ranges]
+    parameters = FilterParameters(particles=8, map_width=width)
+    slam = LocalSlam(parameters, 0)
+    slam.begin(points[0], np.zeros((parameters.particles, 3)))
+    for i in range(1, steps):
+        tracked = slam.add(points[i], np.array([step, 0.0, 0.0]))
+        assert abs(tracked.pose[0] - poses[i, 0]) < 0.4
