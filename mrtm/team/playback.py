@@ -20,7 +20,7 @@ from mrtm.team.records import SightingRecord
 from mrtm.team.sightings_file import TimedSighting, sighting_times
 from mrtm.team.store import item_of
 from mrtm.team.teammate import Peers, Teammate
-from mrtm.timing import Stages
+from mrtm.timing import Stages, uninterrupted
 
 LINGER = 0.5  # seconds that robots stay in contact after a sighting, so that they know where they were
 
@@ -75,7 +75,8 @@ class Playback:
         for number, (time, robots) in enumerate(meetings):
             while told and told[0][0] <= time:
                 self._write_down(told.popleft()[1])
-            self._meet(time, robots)
+            with uninterrupted():
+                self._meet(time, robots)
             report(number / len(meetings))
         for _, data in told:
             self._write_down(data)

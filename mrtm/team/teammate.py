@@ -37,7 +37,8 @@ class Peers:
         self.settled: dict[bytes, Teammate] = {}
 
 
-GROWN = 1.1  # times as much is known
+GROWN = 1.1  # times as much is known,
+SEEN = 1.2  # or as many sightings: in a crowd they multiply faster than all else
 
 ROUNDS = 10  # of alignments until the estimate has come to rest, at most
 
@@ -86,11 +87,12 @@ class Teammate:
         return {key: self.judgements[key] for key in ids if key in self.judgements}
 
     def is_due(self) -> bool:
-        """Whether there are GROWN times as many records or sightings to go by as at the last ``think``.
+        """Whether there are GROWN times as many records, or SEEN times as many sightings, as at the last ``think``.
 
         Who thinks only then spends on all the thinking about a growing store a fixed number of times the last.
         """
-        return any(now >= GROWN * max(before, 1) for now, before in zip(self._size(), self._thought, strict=True))
+        sizes = zip((GROWN, SEEN), self._size(), self._thought, strict=True)
+        return any(now >= times * max(before, 1) for times, now, before in sizes)
 
     def learn(self) -> None:
         """Bring the robots' own maps up to date with the records."""

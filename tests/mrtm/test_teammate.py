@@ -15,7 +15,7 @@ from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
 from factors.sighting import Sighting
 from mrtm.joint.sightings.consistency import Verdict
 from mrtm.team.exchange import exchange
-from mrtm.team.records import AnchorRecord, EdgeRecord, Key, Kind, Record, SightingRecord
+from mrtm.team.records import AnchorRecord, EdgeRecord, Key, Kind, Record, SightingRecord, VertexRecord
 from mrtm.team.teammate import Peers, Teammate
 from mrtm.timing import Stages
 from tests.mrtm.sighting_world import STEP, TeamWorld
@@ -61,6 +61,31 @@ def assert_same_maps(one: Teammate, other: Teammate, within: float = 1e-6) -> No
 
 def writer(record: Record) -> str:
     return record.key.robot
+
+
+# When to think.
+
+
+def test_a_robot_thinks_again_when_it_knows_a_tenth_more_or_has_a_fifth_more_sightings() -> None:
+    world = five()
+    records = everything(world)
+    seen = [r for r in records if isinstance(r, SightingRecord)]
+    one = teammate("r0", [r for r in records if not isinstance(r, SightingRecord)])
+    assert one.is_due()
+    one.store.merge(seen[:10])
+    one.think()
+    assert not one.is_due()
+    one.store.merge(seen[10:11])
+    assert not one.is_due()
+    one.store.merge(seen[11:12])
+    assert one.is_due()
+    one.think()
+    known = len(one.store)
+    number = 1000
+    while not one.is_due():
+        one.store.merge([VertexRecord(VertexId("r5", number), 0, 0.0, 0)])
+        number += 1
+    assert 1.1 * known <= len(one.store) < 1.1 * known + 1
 
 
 # Convergence.
