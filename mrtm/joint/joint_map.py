@@ -132,7 +132,7 @@ class JointMap:
             if component.robots == robots and component.added.keys() and mine:
                 try:
                     _exchange(component, mine)
-                    if _misplaced(component) <= GROWN * component.misplaced:
+                    if _within(component) or self._placed_anew(component):
                         continue
                 except GraphError:
                     pass  # perhaps on the way there only
@@ -144,7 +144,7 @@ class JointMap:
                 self._refuse(next(iter(mine.values())), error)
                 self._apart(robots)
             else:
-                component.misplaced = _misplaced(component)
+                component.misplaced = len(_misplaced(component))
                 self._component.update(dict.fromkeys(robots, component))
 
     def _refuse(self, edge: GraphEdge, error: GraphError) -> None:
@@ -164,6 +164,19 @@ class JointMap:
                 a |= b
                 group.update(dict.fromkeys(b, a))
         return sorted({tuple(sorted(members)) for members in group.values()})
+
+    def _placed_anew(self, component: Component) -> bool:
+        """Merge misplaced robots in once more, where sightings have them; whether that helped."""
+        graph, robots = component.graph, component.robots
+        pairs, out = _misplaced(component), set[str]()
+        while pairs:  # the one they have in common
+            count = Counter(robot for pair in pairs for robot in sorted(pair - {graph.root.robot}))
+            worst = max(sorted(count), key=count.__getitem__)
+            out.add(worst)
+            pairs = [pair for pair in pairs if worst not in pair]
+        graph.update(remove_vertices=[vertex for vertex in graph.vertices() if vertex.robot in out])
+        self._merge(graph, {*robots} - out, robots, component.added)
+        return _within(component)
 
     def _grown(self, component: Component, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> Component | None:
         """The component with the robots that come to those it has; None if it has to be made anew."""
@@ -220,7 +233,7 @@ def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
     component.added = added
 
 
-def _misplaced(component: Component) -> int:
+def _misplaced(component: Component) -> list[frozenset[str]]:
     """Pairs of robots of which the graph doubts at least half of what sightings made, and more than a stray edge.
 
     These may have been judged otherwise since, and alignments from where the robots seemed to be may hold them there.
@@ -229,8 +242,13 @@ def _misplaced(component: Component) -> int:
     without_effect = component.graph.doubted()
     known = Counter(frozenset(_ends(e)) for e in fused)
     doubted = Counter(frozenset(_ends(e)) for e in fused if e.id in without_effect)
-    pairs = sum(2 * count >= max(known[robots], MISPLACED) for robots, count in doubted.items())
-    return pairs if pairs > SLIPPED * len(known) else 0
+    pairs = [robots for robots, count in doubted.items() if 2 * count >= max(known[robots], MISPLACED)]
+    return pairs if len(pairs) > SLIPPED * len(known) else []
+
+
+def _within(component: Component) -> bool:
+    """Whether hardly more robots are misplaced than when the component was made."""
+    return len(_misplaced(component)) <= GROWN * component.misplaced
 
 
 def _ends(edge: GraphEdge) -> set[str]:

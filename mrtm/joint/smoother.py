@@ -46,7 +46,11 @@ _PATIENCE = 3  # updates before the next portion, of those that only add vertice
 # Radians: where nothing has turned so far, lengths are right to 5e-5 of themselves, and one step leads to the optimum.
 _FAR = 0.01
 
-_MAX_STEPS = 15
+_MAX_STEPS = 10
+
+# Relative change of the cost at which Levenberg-Marquardt stops: about 2e-5 from the optimum, and at the last digit.
+_CLOSE = 1e-9
+_EXACTLY = 1e-12
 _NEVER = 2**31 - 1  # updates
 
 TOGETHER = 64  # pairs of poses whose covariance is found at once
@@ -118,13 +122,13 @@ class Smoother:
             if np.abs(self._isam.getDelta().vector()).max() < self._tolerance.shift:
                 return
             self._solve(lambda: self._insert({}, gtsam.Values(), (), None))
-        self.refine()
+        self.refine(_CLOSE)
 
-    def refine(self) -> None:
+    def refine(self, tolerance: float = _EXACTLY) -> None:
         """Levenberg-Marquardt over everything from the present estimate, then iSAM2 anew from there."""
         params = gtsam.LevenbergMarquardtParams()
-        params.setRelativeErrorTol(1e-12)
-        params.setAbsoluteErrorTol(1e-12)
+        params.setRelativeErrorTol(tolerance)
+        params.setAbsoluteErrorTol(tolerance)
         params.setLinearSolverType("MULTIFRONTAL_QR")
         graph = self.graph()
         graph.push_back(self._prior)
