@@ -129,7 +129,8 @@ class Smoother:
         params = gtsam.LevenbergMarquardtParams()
         params.setRelativeErrorTol(tolerance)
         params.setAbsoluteErrorTol(tolerance)
-        params.setLinearSolverType("MULTIFRONTAL_QR")
+        exactly = tolerance == _EXACTLY or self._factorization == "QR"  # else Cholesky will do, in half the time
+        params.setLinearSolverType("MULTIFRONTAL_QR" if exactly else "MULTIFRONTAL_CHOLESKY")
         graph = self.graph()
         graph.push_back(self._prior)
         values = gtsam.LevenbergMarquardtOptimizer(graph, self.values(), params).optimize()
