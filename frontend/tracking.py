@@ -117,7 +117,8 @@ class Tracker:
                 step = mirrored
         if len(points.hits) >= MIN_POINTS and not _good(step):
             step = self._search(layers, points, se2.compose(self.pose, increment), increment, step)
-        if not step.searched and not turned_over:
+        followed = not step.searched and not turned_over
+        if followed:
             # Where the whole scan fits badly, a body close by may be why. If it still does without it, it is the path
             # that is wrong, and the walls seem to move.
             good = _good(step)
@@ -125,11 +126,10 @@ class Tracker:
             if standing is not points:
                 prior, information = se2.compose(self.pose, increment), np.diag(1.0 / added)
                 again = self._match(layers, standing, step.pose.copy(), prior, information)
-                if good or _good(again):
+                followed = good or _good(again)
+                if followed:  # the fit stays that of the whole scan
                     step.pose, step.hessian, step.points = again.pose, again.hessian, standing
-                else:
-                    self.movers.start(points)
-        else:
+        if not followed:
             self.movers.start(points)
         step.reversed, step.forward = turned_over, bool(self._sign[0] > 0.0)
         self.pose = step.pose

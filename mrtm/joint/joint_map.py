@@ -132,7 +132,7 @@ class JointMap:
             if component.robots == robots and component.added.keys() and mine:
                 try:
                     _exchange(component, mine)
-                    if _within(component) or self._placed_anew(component):
+                    if _in_place(component) or self._placed_anew(component):
                         continue
                 except GraphError:
                     pass  # perhaps on the way there only
@@ -176,7 +176,7 @@ class JointMap:
             pairs = [pair for pair in pairs if worst not in pair]
         graph.update(remove_vertices=[vertex for vertex in graph.vertices() if vertex.robot in out])
         self._merge(graph, {*robots} - out, robots, component.added)
-        return _within(component)
+        return _in_place(component)
 
     def _grown(self, component: Component, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> Component | None:
         """The component with the robots that come to those it has; None if it has to be made anew."""
@@ -246,7 +246,7 @@ def _misplaced(component: Component) -> list[frozenset[str]]:
     return pairs if len(pairs) > SLIPPED * len(known) else []
 
 
-def _within(component: Component) -> bool:
+def _in_place(component: Component) -> bool:
     """Whether hardly more robots are misplaced than when the component was made."""
     return len(_misplaced(component)) <= GROWN * component.misplaced
 
