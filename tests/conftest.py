@@ -1,4 +1,8 @@
-"""What tests share: where the real logs are, and that no example has to be found in time: machines are noisy."""
+"""What tests share: where the real logs are, and how property tests draw their examples.
+
+No example has to be found in time: machines are noisy. The same code is told the same: what is drawn follows from the
+test itself. To look for new examples, ``pytest --hypothesis-profile default``.
+"""
 
 import os
 from pathlib import Path
@@ -6,7 +10,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-settings.register_profile("mrtm", deadline=None)
+settings.register_profile("mrtm", deadline=None, derandomize=True)
 settings.load_profile("mrtm")
 
 ROOT = Path(__file__).parents[1]
