@@ -9,6 +9,7 @@ Atchuthan 2018, "A micro Lie theory for state estimation in robotics").
 from typing import NamedTuple
 
 import gtsam
+import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -82,6 +83,21 @@ def check_pose_covariance(estimate: UncertainPose, what: str) -> UncertainPose:
     hair = max(1e-12 * float(np.abs(np.nan_to_num(given)).max(initial=0.0)), 10.0 * _MIN_VARIANCE)
     wider = given + hair * np.eye(3) if given.shape == (3, 3) else given
     return UncertainPose(estimate.pose, check_covariance(wider, what))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def squared_mahalanobis(residual, covariance):  # type: ignore[no-untyped-def]
+    """chi2 of a residual (n,) over its positive definite covariance (n, n): NumPy's solver takes ten times as long."""
+    rest, left = residual.copy(), covariance.copy()
+    total = 0.0
+    for i in range(len(rest)):
+        total += rest[i] * rest[i] / left[i, i]
+        for r in range(i + 1, len(rest)):
+            share = left[r, i] / left[i, i]
+            rest[r] -= share * rest[i]
+            for c in range(i + 1, len(rest)):
+                left[r, c] -= share * left[i, c]
+    return total
 
 
 def adjoint_transport(a_T_b: gtsam.Pose2, covariance: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Container, Mapping, Sequence
 import gtsam
 import numpy as np
 
-from factors import EdgeId, GraphEdge, UncertainPose, VertexId, adjoint_transport, compose, inverse
+from factors import EdgeId, GraphEdge, UncertainPose, VertexId, adjoint_transport, compose, inverse, squared_mahalanobis
 from factors.noise import FloatArray
 from mrtm.joint.equations import Equations
 
@@ -79,5 +79,5 @@ def _closures(equations: Equations, one: _Step, others: Sequence[_Step]) -> list
         offset = direct.pose.between(through.pose)
         covariance = through.covariance + adjoint_transport(offset.inverse(), direct.covariance)
         residual = gtsam.Pose2.Logmap(offset)
-        found.append((float(residual @ np.linalg.solve(covariance, residual)), covariance))
+        found.append((float(squared_mahalanobis(residual, covariance)), covariance))
     return found

@@ -4,9 +4,8 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import gtsam
-import numpy as np
 
-from factors import EdgeId, EdgeKind, GraphEdge, UncertainPose, VertexId, factor_of, without_kernel
+from factors import EdgeId, EdgeKind, GraphEdge, UncertainPose, VertexId, factor_of, squared_mahalanobis, without_kernel
 from mrtm.joint.expectation import Expectation
 from mrtm.joint.smoother import Smoother
 
@@ -92,7 +91,7 @@ class Equations:
 def misfit(edge: GraphEdge, tail: gtsam.Pose2, head: gtsam.Pose2) -> float:
     """Squared residual over the edge's covariance, its ends at joint_T_tail and joint_T_head."""
     residual, _ = edge.residual(tail.between(head))
-    return float(residual @ np.linalg.solve(edge.covariance, residual))
+    return float(squared_mahalanobis(residual, edge.covariance))
 
 
 def cut_off(vertices: Collection[VertexId], edges: Iterable[GraphEdge]) -> set[VertexId]:

@@ -6,7 +6,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
-from factors import GraphEdge
+from factors import GraphEdge, squared_mahalanobis
 from factors.noise import FloatArray
 
 
@@ -33,13 +33,13 @@ class Expectation:
 
     def misfit(self, n: int) -> float:
         """chi2 of edge ``n`` over its own covariance."""
-        return _chi2(self._residual[self._rows[n]], self._noise[n])
+        return float(squared_mahalanobis(self._residual[self._rows[n]], self._noise[n]))
 
     def innovation(self, n: int) -> tuple[float, FloatArray]:
         """chi2 of edge ``n`` over its covariance and the estimate's together, and that sum."""
         rows = self._rows[n]
         total = self._noise[n] + self._covariance[rows, rows]
-        return _chi2(self._residual[rows], total), total
+        return float(squared_mahalanobis(self._residual[rows], total)), total
 
     def take(self, n: int) -> None:
         """Let the estimate know of edge ``n``."""
@@ -47,7 +47,3 @@ class Expectation:
         gain = np.linalg.solve(self._noise[n] + self._covariance[rows, rows], self._covariance[rows]).T
         self._residual = self._residual - gain @ self._residual[rows]
         self._covariance = self._covariance - gain @ self._covariance[rows]
-
-
-def _chi2(residual: FloatArray, covariance: FloatArray) -> float:
-    return float(residual @ np.linalg.solve(covariance, residual))

@@ -26,12 +26,14 @@ class Component:
         robots: ascending.
         graph: all their edges, and those added; without added ones the robot's own graph.
         added: what came to them: edges between robots, and alignments of maps, by their ids.
+        own: each robot's own graph, whose edges these are.
         misplaced: pairs of them of which the graph doubted most that sightings made, when it was made.
     """
 
     robots: tuple[str, ...]
     graph: JointGraph
     added: dict[EdgeId, GraphEdge] = field(default_factory=dict)
+    own: dict[str, JointGraph] = field(default_factory=dict)
     misplaced: int = 0
 
 
@@ -74,8 +76,9 @@ class JointMap:
     def learn(self, edges: Iterable[Edge], robots: Iterable[str] = ()) -> None:
         """Take new edges, and new versions of known ones, that robots made within their own maps (M5, M7, M8).
 
-        Any order will do: an edge that nothing connects yet waits for those that do, and a version that comes after a
-        higher one does nothing. An edge that cannot be is ``refused``, and nothing else suffers.
+        Components of several robots have them from the next ``join`` on. Any order will do: an edge that nothing
+        connects yet waits for those that do, and a version that comes after a higher one does nothing. An edge that
+        cannot be is ``refused``, and nothing else suffers.
 
         Args:
             robots: names of robots heard of; one with a single vertex has no edge.
@@ -91,39 +94,20 @@ class JointMap:
                 continue
             known[edge.id] = edge
             changed.add(edge.id.robot)
-        news: dict[tuple[str, ...], list[tuple[JointGraph, JointGraph]]] = {}
         for robot in sorted(changed):
-            graph = self._own.get(robot)
+            alone = robot not in self._own or self._component[robot].graph is self._own[robot]
             own = tuple(edge for _, edge in sorted(self._edges.get(robot, {}).items()))
             self._own[robot], refused = own_graph(robot, own)
             self.refused |= refused
-            if graph is None or self._component[robot].graph is graph:
+            if alone:
                 self._apart([robot])
-            else:
-                news.setdefault(self._component[robot].robots, []).append((graph, self._own[robot]))
-        for robots, graphs in news.items():
-            self._follow(self._component[robots[0]], graphs)
-
-    def _follow(self, component: Component, graphs: Iterable[tuple[JointGraph, JointGraph]]) -> None:
-        """Bring a component up to date with robots' own graphs, as they were and as they are."""
-        before, after = zip(*graphs, strict=True)
-        was, now = ({edge.id: edge for graph in some for edge in graph.edges()} for some in (before, after))
-        try:
-            component.graph.update(
-                add=[edge for i, edge in now.items() if i not in was],
-                replace=[edge for i, edge in now.items() if i in was and edge.version > was[i].version],
-                remove=[i for i in was if i not in now],
-                remove_vertices={v for graph in before for v in graph.vertices()}
-                - {v for graph in after for v in graph.vertices()},
-            )
-        except GraphError:
-            self._apart(component.robots)  # ``join`` makes it anew
 
     def join(self, added: Iterable[GraphEdge]) -> None:
         """Let ``added`` be all the edges beside the robots' own (M11, M13): robots come into one frame, or fall apart.
 
-        Edges that fix a pose join; a range and bearing between robots that nothing else joins is left out. Where the
-        equations cannot be solved with them, the robots stay apart and one of the edges is ``refused``.
+        What was learned since comes in with them. Edges that fix a pose join; a range and bearing between robots that
+        nothing else joins is left out. Where the equations cannot be solved with them, the robots stay apart and one of
+        the edges is ``refused``.
         """
         edges = {edge.id: edge for edge in sorted(added, key=lambda e: e.id)}
         for robots in self.connected(edges.values()):
@@ -131,15 +115,13 @@ class JointMap:
             component = self._component[robots[0]]
             if component.robots == robots and component.added.keys() and mine:
                 try:
-                    _exchange(component, mine)
+                    self._exchange(component, mine)
                     if _in_place(component) or self._placed_anew(component):
                         continue
                 except GraphError:
                     pass  # perhaps on the way there only
             try:
-                component = self._grown(component, robots, mine) or Component(
-                    robots, self._graph_of(robots, mine), mine
-                )
+                component = self._grown(component, robots, mine) or self._made(robots, mine)
             except GraphError as error:
                 self._refuse(next(iter(mine.values())), error)
                 self._apart(robots)
@@ -153,7 +135,7 @@ class JointMap:
     def _apart(self, robots: Iterable[str]) -> None:
         """Let every robot have its own map."""
         for robot in robots:
-            self._component[robot] = Component((robot,), self._own[robot])
+            self._component[robot] = Component((robot,), self._own[robot], {}, {robot: self._own[robot]})
 
     def connected(self, edges: Iterable[GraphEdge]) -> list[tuple[str, ...]]:
         """The robots that edges would bring together, names ascending."""
@@ -185,21 +167,35 @@ class JointMap:
         if len(inside) < 2 or not inside < set(robots) or component.robots not in self.connected(within.values()):
             return None
         try:
-            _exchange(component, within)
+            self._exchange(component, within)
             self._merge(component.graph, inside, robots, added)
         except GraphError:
             return None
-        return Component(robots, component.graph, added)
+        return Component(robots, component.graph, added, {robot: self._own[robot] for robot in robots})
 
-    def _graph_of(self, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> JointGraph:
+    def _made(self, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> Component:
         """The robots' own graphs made one: the first one's, then the others in the order in which they are reached."""
-        root = robots[0]
-        if not added:
-            return self._own[root]
-        graph = JointGraph(VertexId(root, 0))
-        graph.update(add=self._own[root].edges())
-        self._merge(graph, {root}, robots, added)
-        return graph
+        root, graph = robots[0], self._own[robots[0]]
+        if added:
+            graph = JointGraph(VertexId(root, 0))
+            graph.update(add=self._own[root].edges())
+            self._merge(graph, {root}, robots, added)
+        return Component(robots, graph, added, {robot: self._own[robot] for robot in robots})
+
+    def _exchange(self, component: Component, added: dict[EdgeId, GraphEdge]) -> None:
+        """Bring a component whose robots stay the same up to date: its robots' own edges, and other added ones."""
+        changed = [robot for robot in component.robots if component.own[robot] is not self._own[robot]]
+        graphs = [component.own[robot] for robot in changed], [self._own[robot] for robot in changed]
+        was, now = ({edge.id: edge for graph in some for edge in graph.edges()} for some in graphs)
+        vertices, left = ({vertex for graph in some for vertex in graph.vertices()} for some in graphs)
+        was, now = was | component.added, now | added
+        add = [edge for i, edge in now.items() if i not in was]
+        replace = [edge for i, edge in now.items() if i in was and edge.version > was[i].version]
+        gone = [i for i in was if i not in now]
+        if add or replace or gone:
+            component.graph.update(add=add, replace=replace, remove=gone, remove_vertices=vertices - left)
+        component.added = added
+        component.own.update(zip(changed, graphs[1], strict=True))
 
     def _merge(
         self, graph: JointGraph, reached: set[str], robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]
@@ -218,19 +214,6 @@ class JointMap:
             reached = both
         known = {edge.id for edge in graph.edges()}
         graph.update(add=[e for i, e in added.items() if i not in known])
-
-
-def _exchange(component: Component, added: dict[EdgeId, GraphEdge]) -> None:
-    """Bring a component whose robots stay the same to other added edges."""
-    before = component.added
-    add = [e for i, e in added.items() if i not in before]
-    replace = [e for i, e in added.items() if i in before and e.version > before[i].version]
-    gone = [i for i in before if i not in added]
-    if add:
-        component.graph.update(add=add)  # first, so that no robot is cut off in between
-    if replace or gone:
-        component.graph.update(replace=replace, remove=gone)
-    component.added = added
 
 
 def _misplaced(component: Component) -> list[frozenset[str]]:

@@ -3,7 +3,7 @@
 import gtsam
 import numpy as np
 
-from factors import UncertainPose
+from factors import UncertainPose, squared_mahalanobis
 from frontend import se2
 from frontend.records import FloatArray
 
@@ -29,4 +29,4 @@ def innovation(expected: UncertainPose, measured: UncertainPose) -> tuple[FloatA
     The sum of the covariances is right for independent estimates that are not far apart.
     """
     offset = gtsam.Pose2.Logmap(expected.pose.between(measured.pose))
-    return offset, float(offset @ np.linalg.solve(expected.covariance + measured.covariance, offset))
+    return offset, float(squared_mahalanobis(offset, expected.covariance + measured.covariance))

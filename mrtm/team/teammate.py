@@ -14,7 +14,7 @@ from mrtm.joint.sightings.consistency import Judgement, Verdict, judge
 from mrtm.joint.sightings.hypotheses import HypothesisId
 from mrtm.team.evidence import evidence
 from mrtm.team.meeting import anchored, bridges, fusing_edges, sightings
-from mrtm.team.records import EdgeRecord, Key, SightingRecord, VertexRecord
+from mrtm.team.records import EdgeRecord, Key, Kind, SightingRecord, VertexRecord
 from mrtm.team.store import R, Store
 from mrtm.team.surfaces import Surfaces
 from mrtm.timing import Stages
@@ -75,15 +75,17 @@ class Teammate:
         self._stages = stages
         self._peers = peers
         self._maps = Surfaces(self.store)
-        self._fusing: dict[EdgeId, Edge | SightingEdge] = {}
+        self._found: dict[EdgeId, Edge | SightingEdge] = {}  # what the sightings last came to,
+        self._fusing: dict[EdgeId, Edge | SightingEdge] = {}  # and these as versions
         self._told: dict[Key, int] = {}  # version of each record that the joint map knows
         self._held = b""  # the hash of what was known when sightings were last judged
         self._thought = 0, 0  # how many records, and sightings, were known at the last ``think``
 
     def judgements_between(self, robots: tuple[str, str]) -> dict[HypothesisId, Judgement]:
         """The judgements of sightings between two robots."""
-        between = [r for r in self.store.of(SightingRecord) if {r.observer, r.observed} == set(robots)]
-        ids = [(r.observer, r.number) for r in between]
+        seen = (item.record for robot in robots for item in self.store.part(robot, Kind.SIGHTING))
+        between = (r for r in seen if isinstance(r, SightingRecord) and r.observed in robots)
+        ids = ((r.observer, r.number) for r in between)
         return {key: self.judgements[key] for key in ids if key in self.judgements}
 
     def is_due(self) -> bool:
@@ -95,18 +97,23 @@ class Teammate:
         return any(now >= times * max(before, 1) for times, now, before in sizes)
 
     def learn(self) -> None:
+        """Bring the robots' own maps up to date with the records, and the joint map with these."""
+        self._hear()
+        self._enter()
+
+    def think(self) -> None:
+        """Bring the joint map up to date with the records."""
+        self._thought = self._size()
+        self._hear()
+        if self.store.summary() != self._held:
+            self._fuse()
+
+    def _hear(self) -> None:
         """Bring the robots' own maps up to date with the records."""
         robots = {record.id.robot for record in self._news(VertexRecord)}
         edges = [record.edge for record in self._news(EdgeRecord)]
         with self._stages("joint map"):
             self.joint.learn(edges, robots)
-
-    def think(self) -> None:
-        """Bring the joint map up to date with the records."""
-        self._thought = self._size()
-        self.learn()
-        if self.store.summary() != self._held:
-            self._fuse()
 
     def _size(self) -> tuple[int, int]:
         return len(self.store), self.store.count(SightingRecord)
@@ -166,6 +173,7 @@ class Teammate:
             self.judgements, edges = concluded[held]
             self._held = held
         self._fusing = {edge.id: self._versioned(edge) for edge in edges}
+        self._found = {edge.id: edge for edge in edges}
         self._enter()
 
     def _conclude(self) -> "_Conclusion":
@@ -182,7 +190,7 @@ class Teammate:
         old = self._fusing.get(edge.id)
         if old is None:
             return edge
-        return old if _same(old, edge) else replace(edge, version=old.version + 1)
+        return old if self._found[edge.id] is edge or _same(old, edge) else replace(edge, version=old.version + 1)
 
     def _enter(self) -> None:
         """Let the fusing edges, and the alignments within what they join, be what the joint map holds."""

@@ -119,6 +119,7 @@ def test_a_version_that_comes_twice_or_late_does_nothing(whole: JointMap) -> Non
 def test_a_new_version_reaches_the_joint_graph() -> None:
     joint = told(FIRST, JOINS)
     joint.learn(EDGES)
+    joint.join(JOINS)
     (component,) = joint.components()
     versions = {e.id: e.version for e in component.graph.edges()}
     assert all(versions[e.id] == e.id.number % 2 for e in FIRST)
@@ -169,6 +170,7 @@ def test_after_a_refused_version_a_higher_good_one_counts() -> None:
     good = next(e for e in FIRST if e.id == bad.id)
     better = Edge(good.id, 9, good.kind, good.tail, good.head, good.measurement, 0.1 * good.covariance)
     joint.learn([better])
+    joint.join(JOINS)
     (component,) = joint.components()
     assert {e.id: e.version for e in component.graph.edges()}[bad.id] == 9
 

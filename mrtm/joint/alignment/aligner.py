@@ -11,7 +11,7 @@ from itertools import islice
 import gtsam
 import numpy as np
 
-from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId
+from factors import Edge, EdgeId, EdgeKind, UncertainPose, VertexId, squared_mahalanobis
 from frontend.records import FloatArray
 from mrtm.joint.alignment.align import Alignment, align
 from mrtm.joint.alignment.candidates import Candidate, pairs
@@ -90,10 +90,10 @@ class Aligner:
             maps: of its closed vertices.
         """
         poses = graph.estimates()
-        closed = {v: maps[v] for v in poses if v in maps}
+        closed = {v: found for v in poses if (found := maps.get(v))}
 
         def wanted(a: VertexId, b: VertexId) -> bool:
-            return self._open((a, b), (closed[a], closed[b]), poses[a].between(poses[b]))
+            return self._open((a, b), (closed[a], closed[b]), poses)
 
         looks = SCREENED * most
         asked: dict[Pair, UncertainPose] = {}
@@ -135,12 +135,12 @@ class Aligner:
                 gone.append(attempt.edge.id)
         return gone
 
-    def _open(self, pair: Pair, maps: tuple[Surface, Surface], a_T_b: gtsam.Pose2) -> bool:
+    def _open(self, pair: Pair, maps: tuple[Surface, Surface], poses: Mapping[VertexId, gtsam.Pose2]) -> bool:
         """Whether the pair, as its maps are now, is new, or has moved since it was refused."""
         old = self.attempts.get(pair)
         if old is None or not _unchanged(old, maps):
             return True
-        return old.edge is None and _moved(old, a_T_b) > MOVED
+        return old.edge is None and _moved(old, poses[pair[0]].between(poses[pair[1]])) > MOVED
 
     def _due(self, pair: Pair, maps: tuple[Surface, Surface], guess: UncertainPose) -> bool:
         """Whether a pair without an alignment is worth a try, the first or another."""
@@ -167,7 +167,7 @@ class Aligner:
 def _moved(attempt: Attempt, a_T_b: gtsam.Pose2) -> float:
     """Squared Mahalanobis distance, as the guess saw it."""
     offset = gtsam.Pose2.Logmap(attempt.guess.pose.between(a_T_b))
-    return float(offset @ np.linalg.solve(attempt.guess.covariance, offset))
+    return float(squared_mahalanobis(offset, attempt.guess.covariance))
 
 
 def _unchanged(attempt: Attempt, maps: tuple[Surface, Surface]) -> bool:

@@ -1,11 +1,13 @@
 """Which closed maps are worth aligning after an event: those that are likely to overlap, not all pairs of all."""
 
+import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from itertools import islice
 from typing import NamedTuple
 
 import gtsam
+import numba
 import numpy as np
 
 from factors import UncertainPose, VertexId
@@ -50,21 +52,33 @@ def pairs(
     if not vertices:
         return []
     circles = np.array([_circle(maps[vertex], poses[vertex]) for vertex in vertices])
-    apart = np.hypot(*(circles[:, None, :2] - circles[None, :, :2]).transpose(2, 0, 1))
-    apart -= circles[:, None, 2] + circles[None, :, 2]
-    i, k = np.nonzero(np.triu(apart <= MAX_XY, 1))
+    rows, columns, apart = _near(circles, MAX_XY)
     found: list[tuple[float, Candidate]] = []
-    nearest = ((int(i[place]), int(k[place])) for place in np.argsort(apart[i, k], kind="stable"))
-    asked = list(islice(((r, c) for r, c in nearest if wanted(vertices[r], vertices[c])), looks))
-    ends = [(vertices[row], vertices[column]) for row, column in asked]
-    for place, (a, b), guess in zip(asked, ends, relatives(ends), strict=True):
-        if apart[place] > 3.0 * np.sqrt(np.linalg.eigvalsh(guess.covariance[:2, :2])[1]):
+    nearest = ((vertices[rows[n]], vertices[columns[n]], apart[n]) for n in np.argsort(apart, kind="stable"))
+    asked = list(islice((near for near in nearest if wanted(*near[:2])), looks))
+    for (a, b, between), guess in zip(asked, relatives([(a, b) for a, b, _ in asked]), strict=True):
+        if between > 3.0 * np.sqrt(np.linalg.eigvalsh(guess.covariance[:2, :2])[1]):
             continue
         area = _likely_overlap(maps[a], maps[b], guess)
         if area >= LEAST_OVERLAP:
             found.append((area, Candidate(a, b, guess)))
     found.sort(key=lambda item: (-item[0], item[1].a, item[1].b))
     return [candidate for _, candidate in found[:most]]
+
+
+@numba.njit(cache=True)
+def _near(circles, reach):  # type: ignore[no-untyped-def]
+    """Rows of every two circles that are ``reach`` apart or nearer, and how far; less than nothing if they overlap."""
+    rows, columns, apart = [], [], []
+    for i in range(len(circles)):
+        for k in range(i + 1, len(circles)):
+            dx, dy = circles[i, 0] - circles[k, 0], circles[i, 1] - circles[k, 1]
+            centres = reach + circles[i, 2] + circles[k, 2]
+            if dx * dx + dy * dy <= centres * centres:
+                rows.append(i)
+                columns.append(k)
+                apart.append(math.sqrt(dx * dx + dy * dy) - circles[i, 2] - circles[k, 2])
+    return np.array(rows), np.array(columns), np.array(apart)
 
 
 def _circle(surface: Surface, pose: gtsam.Pose2) -> FloatArray:

@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 
+from factors import squared_mahalanobis
 from frontend import se2
 from mrtm.joint.sightings.block_cholesky import (
     Blocks,
@@ -76,7 +77,7 @@ def solve(maps: Sequence[OwnMap], sightings: Measurements, believed: BoolArray, 
     """
     trees, measured, informations = _own_edges(maps)
     chosen = np.flatnonzero(believed)
-    seen = sightings.rows(chosen, np.arange(len(start)))
+    seen = sightings.rows(chosen)
     tails, heads = np.concatenate([trees[:, 0], seen.tail]), np.concatenate([trees[:, 1], seen.head])
     wanted = _asked_about(maps, sightings)
     # The first is fixed: nothing of it varies, and the rows of the equations begin with the second.
@@ -106,19 +107,57 @@ def examine(frame: CommonFrame, sightings: Measurements, believed: BoolArray) ->
     predicted, covariance = frame.predict(sightings.tail, sightings.head)
     residual, derivative = innovations(sightings, predicted)
     explained = derivative @ covariance @ np.swapaxes(derivative, -1, -2)
-    noise = sightings.noise
     # Without itself the innovation of a believed one has covariance N M^-1 N and value N M^-1 r, M = N - H P H'.
-    total = np.where(believed[:, None, None], noise - explained, noise + explained)
+    total = np.where(believed[:, None, None], sightings.noise - explained, sightings.noise + explained)
+    chi2, spread = np.empty(len(sightings)), np.empty(len(sightings))
+    _judge(sightings.noise, total, residual, believed, chi2, spread)
+    rest = np.flatnonzero(np.isnan(chi2))
+    if len(rest):
+        chi2[rest], spread[rest] = _alone(sightings.noise[rest], total[rest], residual[rest]), np.inf
+    return Examination(chi2, spread)
+
+
+def _alone(noise: FloatArray, total: FloatArray, residual: FloatArray) -> FloatArray:
+    """(n,) chi2 where no more than _ALONE of a sighting's noise is left in some direction of its residual."""
     scale = np.linalg.cholesky(noise)
     white = np.linalg.solve(scale, np.swapaxes(np.linalg.solve(scale, total), -1, -2))
-    white = 0.5 * (white + np.swapaxes(white, -1, -2))
-    values, vectors = np.linalg.eigh(white)
-    alone = values[:, 0] < _ALONE
-    values = np.maximum(values, _ALONE)
+    values, vectors = np.linalg.eigh(0.5 * (white + np.swapaxes(white, -1, -2)))
     r = (np.swapaxes(vectors, -1, -2) @ np.linalg.solve(scale, residual[:, :, None]))[:, :, 0]
-    power = np.where(believed, -0.5, 0.5)
-    spread = np.prod(np.diagonal(scale, axis1=1, axis2=2), axis=1) * np.prod(values ** power[:, None], axis=1)
-    return Examination(np.sum(r * r / values, axis=1), np.where(alone, np.inf, spread))
+    return np.asarray(np.sum(r * r / np.maximum(values, _ALONE), axis=1))
+
+
+@njit(cache=True, error_model="numpy")
+def _judge(noise, total, residual, believed, chi2, spread):  # type: ignore[no-untyped-def]
+    """``chi2`` and ``spread`` of all sightings about which something else tells; of the others NaN."""
+    left = np.empty((3, 3))
+    for j in range(len(residual)):
+        for r in range(3):
+            for c in range(3):
+                left[r, c] = total[j, r, c] - _ALONE * noise[j, r, c]
+        if not _determinant(left) > 0.0:
+            chi2[j] = spread[j] = np.nan
+            continue
+        chi2[j] = squared_mahalanobis(residual[j], total[j])
+        left[:] = total[j]
+        spread[j] = math.sqrt(_determinant(left))
+        if believed[j]:
+            left[:] = noise[j]
+            spread[j] = _determinant(left) / spread[j]
+
+
+@njit(cache=True, error_model="numpy")
+def _determinant(a):  # type: ignore[no-untyped-def]
+    """Of (3, 3), which is used up; NaN if it is not positive definite."""
+    product = 1.0
+    for i in range(3):
+        if not a[i, i] > 0.0:
+            return np.nan
+        product *= a[i, i]
+        for r in range(i + 1, 3):
+            share = a[r, i] / a[i, i]
+            for c in range(i + 1, 3):
+                a[r, c] -= share * a[i, c]
+    return product
 
 
 _ALONE = 1e-6  # share of a sighting's noise that a residual keeps where nothing else tells of it

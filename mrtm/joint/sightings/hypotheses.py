@@ -6,7 +6,7 @@ noise is counted with every sighting as if it were its own: they are far more ce
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from itertools import combinations
 from typing import NamedTuple, Protocol
@@ -194,17 +194,20 @@ class Measurements:
             np.array([h.anchors[1] for h in hypotheses]).reshape(n, 3),
         )
 
-    def rows(self, which: IntArray, vertices: IntArray) -> "Measurements":
-        """Some of them, for the table of vertices that holds row k of the present one at ``vertices[k]``."""
-        return Measurements(
-            vertices[self.tail[which]],
-            vertices[self.head[which]],
-            self.full[which],
-            self.measured[which],
-            self.noise[which],
-            self.tail_anchor[which],
-            self.head_anchor[which],
-        )
+    @classmethod
+    def together(cls, parts: Iterable["Measurements"], rows: Iterable[IntArray]) -> "Measurements":
+        """The sightings of all ``parts``, which have one table of vertices; each part's become some of the ``rows``."""
+        every = [cls.of((), {}, Slack(0.0, 0.0)), *parts]
+        order = np.argsort(np.concatenate([np.zeros(0, np.int64), *rows]))
+        return cls(*(np.concatenate([getattr(part, f.name) for part in every])[order] for f in fields(cls)))
+
+    def of_table(self, vertices: IntArray) -> "Measurements":
+        """The same for the table of vertices that holds row k of the present one at ``vertices[k]``."""
+        return replace(self, tail=vertices[self.tail], head=vertices[self.head])
+
+    def rows(self, which: IntArray) -> "Measurements":
+        """Some of them."""
+        return Measurements(*(getattr(self, f.name)[which] for f in fields(self)))
 
     def __len__(self) -> int:
         return len(self.tail)

@@ -1,17 +1,17 @@
 """From pairs of robots whose frames are known to each other to components, and which sightings fit them."""
 
 import heapq
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import gtsam
 import numpy as np
 
-from factors import UncertainPose, adjoint_transport
+from factors import UncertainPose, VertexId, adjoint_transport
 from frontend import se2
 from mrtm.joint.sightings.common_frame import CommonFrame, examine, solve
 from mrtm.joint.sightings.hypotheses import BoolArray, Hypothesis, IntArray, Measurements, OwnMap, Slack
 from mrtm.joint.sightings.innovation import gates, share_passing
-from mrtm.joint.sightings.pairs import LEAST_SUPPORT, Evidence, Finding, Proposed, find, outnumbers
+from mrtm.joint.sightings.pairs import LEAST_SUPPORT, Evidence, Proposed, find, outnumbers
 
 Pair = tuple[str, str]
 
@@ -45,26 +45,22 @@ class Joining:
         self, hypotheses: Sequence[Hypothesis], maps: Mapping[str, OwnMap], evidence: Evidence | None, slack: Slack
     ) -> None:
         self._hypotheses, self._maps = hypotheses, maps
-        order = [vertex for own in self._maps.values() for vertex in own.vertices]
-        table = {vertex: row for row, vertex in enumerate(order)}
+        table = self._table(maps)
         self._at = {robot: np.array([table[v] for v in own.vertices], np.int64) for robot, own in self._maps.items()}
-        self._table = table
-        self._sightings = Measurements.of(hypotheses, table, slack)
-        self._poses = np.zeros((len(order), 3))
+        self._poses = np.zeros((len(table), 3))
         self._frames: dict[str, tuple[CommonFrame, dict[str, int]]] = {}
         n = len(hypotheses)
-        self.gates = gates(self._sightings.full)
         self.believed, self.lifted = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
         self.chi2, self._decidable = np.full(n, np.nan), np.zeros(n, np.bool_)
         members: dict[Pair, list[int]] = {}
         for row, h in enumerate(hypotheses):
             members.setdefault(h.robots, []).append(row)
         self.rows = {pair: np.array(members[pair], np.int64) for pair in sorted(members)}
-        self.findings: dict[Pair, Finding] = {}
-        proposed: dict[Pair, Proposed] = {}
-        for pair, rows in self.rows.items():
-            proposed[pair] = self._proposed(pair, rows, slack)
-            self.findings[pair] = find(proposed[pair], None)
+        proposed = {pair: self._proposed(pair, rows, slack) for pair, rows in self.rows.items()}
+        seen = (p.sightings.of_table(np.array([table[v] for v in p.vertices])) for p in proposed.values())
+        self._sightings = Measurements.together(seen, self.rows.values())
+        self.gates = gates(self._sightings.full)
+        self.findings = {pair: find(p, None) for pair, p in proposed.items()}
         self.contradicting: dict[Pair, bool] = {}
         self._settle(self._span(proposed, evidence))
 
@@ -77,13 +73,13 @@ class Joining:
 
     def within(self, slack: Slack) -> BoolArray:
         """(n,) which sightings would fit where they are believed not to, if the poses were uncertain by ``slack``."""
-        wide = Measurements.of(self._hypotheses, self._table, slack)
         fits = np.zeros(len(self.believed), np.bool_)
         for robots in self.components():
             which = np.array([j for j in self._inside(robots).tolist() if not self.believed[j]], np.int64)
             if len(which):
                 frame, _ = self._frames[robots[0]]
-                examined = examine(frame, self._among(robots, which, wide), np.zeros(len(which), np.bool_))
+                wide = Measurements.of([self._hypotheses[j] for j in which.tolist()], self._table(robots), slack)
+                examined = examine(frame, wide, np.zeros(len(which), np.bool_))
                 fits[which] = (examined.chi2 < self.gates[which]) & (
                     share_passing(examined.spread, self._sightings.full[which], self.gates[which]) < CHANCE
                 )
@@ -102,14 +98,15 @@ class Joining:
     def offsets(self) -> dict[Pair, UncertainPose]:
         """Where the frames of pairs that are joined directly lie: that of the second robot in that of the first."""
         offsets = {}
-        for pair, rows in self.rows.items():
-            if not self.believed[rows].any():
-                continue
-            frame, first = self._frames[pair[0]]
-            between, covariance = frame.predict(*(np.array([first[robot]]) for robot in pair))
-            root_a, root_b = (gtsam.Pose2(*self._maps[robot].poses[0]) for robot in pair)
-            pose = root_a.compose(gtsam.Pose2(*between[0])).compose(root_b.inverse())
-            offsets[pair] = UncertainPose(pose, adjoint_transport(root_b, covariance[0]))
+        joined = [pair for pair, rows in self.rows.items() if self.believed[rows].any()]
+        for robots in self.components():
+            inside = [pair for pair in joined if pair[0] in robots]
+            frame, first = self._frames[robots[0]]
+            ends = np.array([[first[a], first[b]] for a, b in inside]).T
+            for pair, between, covariance in zip(inside, *frame.predict(*ends), strict=True):
+                root_a, root_b = (gtsam.Pose2(*self._maps[robot].poses[0]) for robot in pair)
+                pose = root_a.compose(gtsam.Pose2(*between)).compose(root_b.inverse())
+                offsets[pair] = UncertainPose(pose, adjoint_transport(root_b, covariance))
         return offsets
 
     def _inside(self, robots: Sequence[str]) -> IntArray:
@@ -117,12 +114,16 @@ class Joining:
         inside = [rows for (a, b), rows in self.rows.items() if a in robots and b in robots]
         return np.sort(np.concatenate(inside))
 
-    def _among(self, robots: Sequence[str], rows: IntArray, sightings: Measurements | None = None) -> Measurements:
+    def _table(self, robots: Iterable[str]) -> dict[VertexId, int]:
+        """The rows of the vertices of some robots one after the other."""
+        return {v: row for row, v in enumerate(v for robot in robots for v in self._maps[robot].vertices)}
+
+    def _among(self, robots: Sequence[str], rows: IntArray) -> Measurements:
         """Some sightings, for a table of the vertices of some robots one after the other."""
         place = np.full(len(self._poses), -1, np.int64)
         vertices = self._vertices(robots)
         place[vertices] = np.arange(len(vertices))
-        return (sightings or self._sightings).rows(rows, place)
+        return self._sightings.rows(rows).of_table(place)
 
     def _vertices(self, robots: Sequence[str]) -> IntArray:
         return np.concatenate([self._at[robot] for robot in robots])
