@@ -91,13 +91,14 @@ class Doubts:
                 unseen = len(equations.doubted) + 1
 
     def _let_in(self, equations: Equations, waiting: Sequence[EdgeId]) -> list[EdgeId]:
-        """All that the estimate agrees with, or else those that its uncertainty explains."""
+        """Those that the estimate agrees with, if they are most; else those that its uncertainty explains as well."""
         misfits = {i: equations.misfit(equations.edges[i]) for i in waiting}
         near = [i for i, chi2 in misfits.items() if chi2 <= FULL_WEIGHT[len(equations.edges[i].covariance)]]
-        if near:
+        if near and 2 * len(near) >= len(waiting):
             equations.believe(near)
             return near
-        nearer = [i for i, chi2 in misfits.items() if chi2 < NEARER * equations.doubted[i]]
+        nearer = [i for i, chi2 in misfits.items() if i not in near and chi2 < NEARER * equations.doubted[i]]
+        nearer = near + nearer
         for first in range(0, len(nearer), TOGETHER):
             if true := _told_true(equations, nearer[first : first + TOGETHER]):
                 # At their full weight first: the kernel, which does not know of the drift, would hold them off.

@@ -68,7 +68,8 @@ class Equations:
         """Let doubted edges in, at their full weight if not under their kernel."""
         self._smoother.update({i: self._factor(i, kernel) for i in ids}, gtsam.Values(), ())
         if not kernel:
-            self._smoother.settle()  # a kernel that follows is to weigh the optimum, not the first step towards it
+            # A kernel that follows is to weigh the optimum, not the first step towards it.
+            self._smoother.settle(roughly=True)
         for i in ids:
             del self.doubted[i]
 

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag
 
 from factors import GraphEdge, squared_mahalanobis
 from factors.noise import FloatArray
@@ -24,11 +25,8 @@ class Expectation:
         ends = np.cumsum([0, *map(len, residuals)]).tolist()
         self._rows = [slice(*both) for both in pairwise(ends)]
         self._residual = np.concatenate(residuals)
-        self._covariance = np.zeros((ends[-1], ends[-1]))
-        for n, rows in enumerate(self._rows):
-            for m, columns in enumerate(self._rows):
-                block = known[3 * n : 3 * n + 3, 3 * m : 3 * m + 3]
-                self._covariance[rows, columns] = jacobians[n] @ block @ jacobians[m].T
+        jacobian = block_diag(*jacobians)
+        self._covariance = jacobian @ known @ jacobian.T
         self._noise = [e.covariance for e in edges]
 
     def misfit(self, n: int) -> float:

@@ -46,6 +46,8 @@ _PATIENCE = 3  # updates before the next portion, of those that only add vertice
 # Radians: where nothing has turned so far, lengths are right to 5e-5 of themselves, and one step leads to the optimum.
 _FAR = 0.01
 
+_ROUGHLY = 2e-3  # metres and radians: less than what decides about an edge
+
 _MAX_STEPS = 10
 _NEVER = 2**31 - 1  # updates
 
@@ -108,14 +110,19 @@ class Smoother:
         if self._tolerance is _EXACT:
             self.settle()
 
-    def settle(self) -> None:
-        """Linearise anew until nothing is left to be; of a large graph once, and if it is needed to go on from here."""
+    def settle(self, roughly: bool = False) -> None:
+        """Linearise anew until nothing is left to be; of a large graph once, and if it is needed to go on from here.
+
+        Args:
+            roughly: to _ROUGHLY from the optimum.
+        """
         if self._tolerance is _COARSE:
             if self._turn().max() > _FAR:
                 self._solve(lambda: self._insert({}, gtsam.Values(), (), None))
             return
+        left = _ROUGHLY if roughly else self._tolerance.shift
         for _ in range(_MAX_STEPS):
-            if np.abs(self._isam.getDelta().vector()).max() < self._tolerance.shift:
+            if np.abs(self._isam.getDelta().vector()).max() < left:
                 return
             self._solve(lambda: self._insert({}, gtsam.Values(), (), None))
         self.refine(exactly=False)

@@ -27,15 +27,12 @@ WEAK = 100.0  # times the covariance of an offset that others have measured alre
 def sightings(store: Store, graphs: Mapping[str, JointGraph]) -> list[Hypothesis]:
     """The sightings that have both ends: where both robots were, in vertices that the robots' graphs know."""
     anchors = {(r.robot, r.number): r for r in store.of(AnchorRecord)}
-    known = {robot: set(graph.vertices()) for robot, graph in graphs.items()}
+    known = {vertex for graph in graphs.values() for vertex in graph.vertices()}
     found = []
     for record in store.of(SightingRecord):
         observer, observed = anchors.get(record.observer_anchor), anchors.get(record.observed_anchor)
-        if observer is None or observed is None:
-            continue
-        if any(a.vertex not in known.get(a.vertex.robot, ()) for a in (observer, observed)):
-            continue
-        found.append(_hypothesis(record, observer, observed))
+        if observer and observed and observer.vertex in known and observed.vertex in known:
+            found.append(_hypothesis(record, observer, observed))
     return found
 
 

@@ -8,7 +8,7 @@ stays, for everybody. So stores that have been told the same records, in any ord
 import hashlib
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import TypeVar, cast
 from weakref import WeakValueDictionary
 
 from mrtm.team.codec import KINDS, pack, unpack
@@ -81,6 +81,7 @@ class Store:
         self._items: dict[str, dict[tuple[Kind, int], Item]] = {}
         self._hashes: dict[str, bytes] = {}  # of each writer's items, as far as they are known
         self._parts: dict[tuple[str, Kind], tuple[Item, ...]] = {}  # those of one writer and kind, likewise
+        self._read: dict[tuple[str, Kind], tuple[Record, ...]] = {}  # their records, but for maps
 
     def put(self, record: Record) -> bool:
         """Learn a record; False if it, or a higher version, is known already.
@@ -101,6 +102,7 @@ class Store:
         known[place] = item
         self._hashes.pop(item.key.robot, None)
         self._parts.pop((item.key.robot, item.key.kind), None)
+        self._read.pop((item.key.robot, item.key.kind), None)
         return True
 
     def merge(self, records: Iterable[Record]) -> list[Key]:
@@ -133,10 +135,7 @@ class Store:
     def of(self, kind: type[R]) -> Iterator[R]:
         """The records of one type, by robot and number; maps are unpacked one after the other."""
         for robot in sorted(self._items):
-            for item in self.part(robot, kind.kind):
-                record = item.record
-                assert isinstance(record, kind)
-                yield record
+            yield from cast("Iterable[R]", self._records(robot, kind.kind))
 
     def count(self, kind: type[R]) -> int:
         """How many records of one type there are."""
@@ -149,6 +148,14 @@ class Store:
             known = self._items.get(robot, {})
             self._parts[name] = tuple(item for (found, _), item in sorted(known.items()) if found == kind)
         return self._parts[name]
+
+    def _records(self, robot: str, kind: Kind) -> Iterable[Record]:
+        """Those of one writer and kind, by number."""
+        if kind is Kind.MAP:
+            return (item.record for item in self.part(robot, kind))
+        if (robot, kind) not in self._read:
+            self._read[robot, kind] = tuple(item.record for item in self.part(robot, kind))
+        return self._read[robot, kind]
 
     def records(self) -> Iterator[Record]:
         """All records, topology first; maps, which come last, are unpacked one after the other."""
