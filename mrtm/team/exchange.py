@@ -1,8 +1,8 @@
 """A meeting (M10): two robots find out what the other lacks, and send it.
 
     a -> b  SUMMARY  a hash of all a knows. The same as b's: the meeting is over.
-    b -> a  WRITERS  a hash for each robot that b has records of.
-    a -> b  KEYS     what a has of the robots whose hashes differ.
+    b -> a  PARTS    a hash for each part of what b knows: of one robot and kind, up to PART records.
+    a -> b  KEYS     what a has of the parts whose hashes differ.
     b -> a  RECORDS  what a lacks;  WANTS  keys of what b lacks.
     a -> b  RECORDS  those.
 
@@ -23,17 +23,18 @@ from mrtm.team.messages import (
     Stage,
     open_message,
     pack_keys,
+    pack_parts,
     pack_wants,
     seal,
     unpack_keys,
+    unpack_parts,
     unpack_wants,
-    unpack_writers,
 )
 from mrtm.team.records import Key, Kind
 from mrtm.team.store import Digest, Item, Store, item_of
 
 MOST_KEYS = 4096
-"""Records that one message tells of, unless one writer has more."""
+"""Records that one message tells of, or a few more."""
 
 __all__ = ["Link", "Outcome", "Store", "Traffic", "exchange", "opening", "perfect", "receive"]
 
@@ -111,10 +112,10 @@ def receive(store: Store, message: bytes) -> Outcome:
         match stage:
             case Stage.SUMMARY:
                 if content != store.summary():
-                    outcome.replies.append(("digest", seal(Stage.WRITERS, store.writers())))
-            case Stage.WRITERS:
-                theirs, ours = unpack_writers(content), store.writers()
-                differ = sorted(name for name in theirs | ours if theirs.get(name) != ours.get(name))
+                    outcome.replies.append(("digest", seal(Stage.PARTS, pack_parts(store.parts()))))
+            case Stage.PARTS:
+                theirs, ours = unpack_parts(content), store.parts()
+                differ = sorted(part for part in theirs | ours if theirs.get(part) != ours.get(part))
                 outcome.replies.extend(_keys(store.digest(differ)))
             case Stage.KEYS:
                 digest = unpack_keys(content)
@@ -145,17 +146,17 @@ def _learn(store: Store, content: object, outcome: Outcome) -> None:
 
 
 def _keys(digest: Digest) -> Iterator[tuple[str, bytes]]:
-    """Messages of about MOST_KEYS keys, those of one writer in one message."""
-    part: Digest = {}
+    """Messages of about MOST_KEYS keys, those of one part in one message."""
+    told: Digest = {}
     size = 0
-    for name, known in digest.items():
-        if part and size + len(known) > MOST_KEYS:
-            yield "digest", seal(Stage.KEYS, pack_keys(part))
-            part, size = {}, 0
-        part[name] = known
+    for part, known in digest.items():
+        if told and size + len(known) > MOST_KEYS:
+            yield "digest", seal(Stage.KEYS, pack_keys(told))
+            told, size = {}, 0
+        told[part] = known
         size += 1 + len(known)
-    if part:
-        yield "digest", seal(Stage.KEYS, pack_keys(part))
+    if told:
+        yield "digest", seal(Stage.KEYS, pack_keys(told))
 
 
 def _records(items: Iterable[Item]) -> Iterator[tuple[str, bytes]]:

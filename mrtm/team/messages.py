@@ -2,8 +2,9 @@
 
 import hashlib
 import reprlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
+from itertools import islice
 from typing import Any
 
 import msgpack
@@ -14,9 +15,9 @@ from mrtm.errors import MrtmError
 from mrtm.team.checks import RecordError, check_name
 from mrtm.team.codec import KINDS
 from mrtm.team.records import Key, Kind
-from mrtm.team.store import Digest
+from mrtm.team.store import PART, PART_HASH, Digest, Part
 
-PROTOCOL = 1
+PROTOCOL = 2
 LARGEST_MESSAGE = 2**20
 """Bytes, packed and unpacked."""
 CHUNK = 32 * 1024
@@ -35,7 +36,7 @@ class Stage(IntEnum):
     """The messages of a meeting, see ``exchange``; a message is answered by later ones only."""
 
     SUMMARY = 0
-    WRITERS = 1
+    PARTS = 1
     KEYS = 2
     WANTS = 3
     RECORDS = 4
@@ -72,26 +73,40 @@ def open_message(message: bytes) -> tuple[Stage, Any]:
         raise MessageError(f"message cannot be unpacked: {error}") from error
 
 
-def unpack_writers(content: Any) -> dict[str, bytes]:
-    """The content of WRITERS: a hash for each writer.
+def pack_parts(hashes: Mapping[Part, bytes]) -> dict[str, list[bytes]]:
+    """The content of PARTS: for each writer columns of its parts: kinds, blocks, hashes."""
+    columns = {}
+    for robot, rows in _by_robot(hashes).items():
+        columns[robot] = [*_pack_places(rows), b"".join(hashes[part] for *_, part in rows)]
+    return columns
+
+
+def unpack_parts(content: Any) -> dict[Part, bytes]:
+    """What ``pack_parts`` packed.
 
     Raises:
         MessageError: it is of another shape.
     """
-    if not isinstance(content, dict) or not all(isinstance(part, bytes) for part in content.values()):
-        raise MessageError(f"message of writers: {reprlib.repr(content)}; must be a hash for each")
-    for name in content:
-        _check_writer(name)
-    return content
+    found: dict[Part, bytes] = {}
+    for robot, (kinds, blocks, hashes) in _columns(content, 3):
+        places = _unpack_places(robot, kinds, blocks)
+        if len(hashes) != PART_HASH * len(places):
+            raise MessageError(f"message of parts: those of {robot} are not columns of one length")
+        names = (hashes[i : i + PART_HASH] for i in range(0, len(hashes), PART_HASH))
+        found.update((Part(robot, *place), name) for place, name in zip(places, names, strict=True))
+    return found
 
 
 def pack_keys(digest: Digest) -> dict[str, list[bytes]]:
-    """The content of KEYS: for each writer columns of its records: kinds, numbers, versions, beginnings of hashes."""
+    """The content of KEYS: for each writer columns of its parts: kinds, blocks, how many records of each; and of these:
+    places within the part, versions, beginnings of hashes."""
     columns = {}
-    for writer, known in digest.items():
-        rows = sorted((KINDS.index(kind), number, *stamp) for (kind, number), stamp in known.items())
-        versions = np.array([row[2] for row in rows], "<u4").tobytes()
-        columns[writer] = [*_pack_places(rows), versions, b"".join(row[3][:_SHORT] for row in rows)]
+    for robot, rows in _by_robot(digest).items():
+        known = [sorted(digest[part].items()) for *_, part in rows]
+        every = [(number % PART, *stamp) for some in known for number, stamp in some]
+        versions = np.array([version for _, version, _ in every], "<u4").tobytes()
+        within, hashes = bytes(place for place, *_ in every), b"".join(name[:_SHORT] for *_, name in every)
+        columns[robot] = [*_pack_places(rows), bytes(map(len, known)), within, versions, hashes]
     return columns
 
 
@@ -102,13 +117,17 @@ def unpack_keys(content: Any) -> Digest:
         MessageError: it is of another shape.
     """
     digest: Digest = {}
-    for writer, (kinds, numbers, versions, hashes) in _columns(content, 4):
-        places = _unpack_places(writer, kinds, numbers)
-        if len(versions) != 4 * len(places) or len(hashes) != _SHORT * len(places):
-            raise MessageError(f"message of keys: those of {writer} are not columns of one length")
+    for robot, (kinds, blocks, counts, within, versions, hashes) in _columns(content, 6):
+        places = _unpack_places(robot, kinds, blocks)
+        lengths = len(within), len(versions) // 4, len(hashes) // _SHORT
+        whole = len(versions) % 4 == len(hashes) % _SHORT == 0
+        if not whole or len(counts) != len(places) or {*lengths} != {sum(counts)} or max(within, default=0) >= PART:
+            raise MessageError(f"message of keys: those of {robot} are not columns of one length, within their parts")
         beginnings = (hashes[i : i + _SHORT] for i in range(0, len(hashes), _SHORT))
-        stamps = zip(np.frombuffer(versions, "<u4").tolist(), beginnings, strict=True)
-        digest[writer] = dict(zip(places, stamps, strict=True))
+        stamps = zip(within, np.frombuffer(versions, "<u4").tolist(), beginnings, strict=True)
+        for (kind, block), count in zip(places, counts, strict=True):
+            known = {PART * block + place: (version, name) for place, version, name in islice(stamps, count)}
+            digest[Part(robot, kind, block)] = known
     return digest
 
 
@@ -131,6 +150,14 @@ def unpack_wants(content: Any) -> list[Key]:
         for writer, columns in _columns(content, 2)
         for kind, number in _unpack_places(writer, *columns)
     ]
+
+
+def _by_robot(parts: Iterable[Part]) -> dict[str, list[tuple[int, int, Part]]]:
+    """Kind, block and name of the parts of each writer, ascending."""
+    rows: dict[str, list[tuple[int, int, Part]]] = {}
+    for part in parts:
+        rows.setdefault(part.robot, []).append((KINDS.index(part.kind), part.block, part))
+    return {robot: sorted(some) for robot, some in rows.items()}
 
 
 def _columns(content: Any, count: int) -> Iterator[tuple[str, list[bytes]]]:

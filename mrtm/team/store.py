@@ -6,9 +6,10 @@ stays, for everybody. So stores that have been told the same records, in any ord
 """
 
 import hashlib
-from collections.abc import Collection, Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import TypeVar, cast
+from typing import NamedTuple, TypeVar, cast
 from weakref import WeakValueDictionary
 
 from mrtm.team.codec import KINDS, pack, unpack
@@ -19,13 +20,26 @@ R = TypeVar("R", VertexRecord, EdgeRecord, MapRecord, AnchorRecord, SightingReco
 HASH = 16
 """Bytes of a record's hash (BLAKE2b)."""
 
-_PART = 8  # bytes of a hash of many records, which is only compared
+PART_HASH = 8
+"""Bytes of a hash of many records, which is only compared."""
+
+PART = 64
+"""Records of consecutive numbers in a part: news are few beside what two robots know already, and mostly the latest."""
+
+
+class Part(NamedTuple):
+    """Records of one writer and kind: those numbered from PART * ``block`` on."""
+
+    robot: str
+    kind: Kind
+    block: int
+
 
 Stamp = tuple[int, bytes]
 """Version and hash of a record's bytes, or the hash's beginning; the larger wins."""
 
-Digest = dict[str, dict[tuple[Kind, int], Stamp]]
-"""What somebody knows: for every writer (kind, number) and stamp of its records."""
+Digest = dict[Part, dict[int, Stamp]]
+"""What somebody knows: for every part the number and stamp of its records."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -78,10 +92,12 @@ class Store:
     """The records a robot knows, its own and those it was told."""
 
     def __init__(self) -> None:
-        self._items: dict[str, dict[tuple[Kind, int], Item]] = {}
-        self._hashes: dict[str, bytes] = {}  # of each writer's items, as far as they are known
-        self._parts: dict[tuple[str, Kind], tuple[Item, ...]] = {}  # those of one writer and kind, likewise
-        self._read: dict[tuple[str, Kind], tuple[Record, ...]] = {}  # their records, but for maps
+        self._items: dict[tuple[str, Kind], dict[int, dict[int, Item]]] = {}  # by block, by number
+        self._counts: Counter[Kind] = Counter()
+        self._hashes: dict[Part, bytes] = {}  # as far as they are known
+        self._summary: bytes | None = None  # likewise
+        self._runs: dict[tuple[str, Kind], tuple[Item, ...]] = {}  # those of one writer and kind, likewise
+        self._records: dict[tuple[str, Kind], tuple[Record, ...]] = {}  # theirs, but for maps
 
     def put(self, record: Record) -> bool:
         """Learn a record; False if it, or a higher version, is known already.
@@ -95,14 +111,17 @@ class Store:
 
     def add(self, item: Item) -> bool:
         """Learn a packed record; False if it, or a higher version, is known already."""
-        known = self._items.setdefault(item.key.robot, {})
-        place = (item.key.kind, item.key.number)
-        if place in known and known[place].stamp >= item.stamp:
+        run, part = (item.key.robot, item.key.kind), _part_of(item.key)
+        known = self._items.setdefault(run, {}).setdefault(part.block, {})
+        old = known.get(item.key.number)
+        if old is not None and old.stamp >= item.stamp:
             return False
-        known[place] = item
-        self._hashes.pop(item.key.robot, None)
-        self._parts.pop((item.key.robot, item.key.kind), None)
-        self._read.pop((item.key.robot, item.key.kind), None)
+        known[item.key.number] = item
+        self._counts[part.kind] += old is None
+        self._summary = None
+        self._hashes.pop(part, None)
+        self._runs.pop(run, None)
+        self._records.pop(run, None)
         return True
 
     def merge(self, records: Iterable[Record]) -> list[Key]:
@@ -114,10 +133,10 @@ class Store:
         return [record.key for record in records if self.put(record)]
 
     def __len__(self) -> int:
-        return sum(map(len, self._items.values()))
+        return self._counts.total()
 
     def __contains__(self, key: Key) -> bool:
-        return (key.kind, key.number) in self._items.get(key.robot, {})
+        return key.number in self._within(_part_of(key))
 
     def __getitem__(self, key: Key) -> Record:
         """The record of a key, unpacked; KeyError if it is not known."""
@@ -125,37 +144,29 @@ class Store:
 
     def item(self, key: Key) -> Item:
         """The packed record of a key; KeyError if it is not known."""
-        return self._items[key.robot][key.kind, key.number]
+        return self._within(_part_of(key))[key.number]
 
     def keys(self, kind: Kind) -> Iterator[Key]:
         """The keys of one kind, by robot and number."""
-        for robot in sorted(self._items):
-            yield from (item.key for item in self.part(robot, kind))
+        for robot in self._robots(kind):
+            yield from (item.key for item in self.run(robot, kind))
 
     def of(self, kind: type[R]) -> Iterator[R]:
         """The records of one type, by robot and number; maps are unpacked one after the other."""
-        for robot in sorted(self._items):
-            yield from cast("Iterable[R]", self._records(robot, kind.kind))
+        for robot in self._robots(kind.kind):
+            yield from cast("Iterable[R]", self._read(robot, kind.kind))
 
     def count(self, kind: type[R]) -> int:
         """How many records of one type there are."""
-        return sum(len(self.part(robot, kind.kind)) for robot in self._items)
+        return self._counts[kind.kind]
 
-    def part(self, robot: str, kind: Kind) -> tuple[Item, ...]:
+    def run(self, robot: str, kind: Kind) -> tuple[Item, ...]:
         """The items of one writer and kind, by number."""
         name = robot, kind
-        if name not in self._parts:
-            known = self._items.get(robot, {})
-            self._parts[name] = tuple(item for (found, _), item in sorted(known.items()) if found == kind)
-        return self._parts[name]
-
-    def _records(self, robot: str, kind: Kind) -> Iterable[Record]:
-        """Those of one writer and kind, by number."""
-        if kind is Kind.MAP:
-            return (item.record for item in self.part(robot, kind))
-        if (robot, kind) not in self._read:
-            self._read[robot, kind] = tuple(item.record for item in self.part(robot, kind))
-        return self._read[robot, kind]
+        if name not in self._runs:
+            blocks = sorted(self._items.get(name, {}).items())
+            self._runs[name] = tuple(item for _, known in blocks for _, item in sorted(known.items()))
+        return self._runs[name]
 
     def records(self) -> Iterator[Record]:
         """All records, topology first; maps, which come last, are unpacked one after the other."""
@@ -163,46 +174,72 @@ class Store:
 
     def summary(self) -> bytes:
         """A hash of everything: equal if and only if two stores hold the same."""
-        whole = hashlib.blake2b(digest_size=_PART)
-        for robot, part in sorted(self.writers().items()):
-            whole.update(robot.encode() + b"\0" + part)
-        return whole.digest()
+        if self._summary is None:
+            whole = hashlib.blake2b(digest_size=PART_HASH)
+            for part, name in sorted(self.parts().items()):
+                whole.update(f"{part.robot} {part.kind} {part.block} ".encode() + name)
+            self._summary = whole.digest()
+        return self._summary
 
-    def writers(self) -> dict[str, bytes]:
-        """For every writer a hash of what is known of it."""
-        for robot, known in self._items.items():
-            if robot not in self._hashes:
-                rows = (b"%d %d %d " % (KINDS.index(k), n, i.version) + i.hash for (k, n), i in sorted(known.items()))
-                self._hashes[robot] = hashlib.blake2b(b"".join(rows), digest_size=_PART).digest()
+    def parts(self) -> dict[Part, bytes]:
+        """For every part a hash of what is known of it."""
+        for part, known in self._known():
+            if part not in self._hashes:
+                rows = (b"%d %d " % (number, item.version) + item.hash for number, item in sorted(known.items()))
+                self._hashes[part] = hashlib.blake2b(b"".join(rows), digest_size=PART_HASH).digest()
         return dict(self._hashes)
 
-    def digest(self, writers: Collection[str] | None = None) -> Digest:
-        """What is known, all or of some writers, which need not be known."""
-        names = self._items if writers is None else writers
-        return {name: {place: item.stamp for place, item in self._items.get(name, {}).items()} for name in names}
+    def digest(self, parts: Iterable[Part] | None = None) -> Digest:
+        """What is known, all or of some parts, of which nothing need be known."""
+        chosen = self._known() if parts is None else ((part, self._within(part)) for part in parts)
+        return {part: {number: item.stamp for number, item in known.items()} for part, known in chosen}
 
-    def missing(self, digest: Digest, writers: Collection[str] | None = None) -> list[Item]:
-        """What somebody lacks that knows ``digest``: of all writers, or of some; topology first, maps last."""
+    def missing(self, digest: Digest, parts: Iterable[Part] | None = None) -> list[Item]:
+        """What somebody lacks that knows ``digest``: of all parts, or of some; topology first, maps last."""
+        chosen = self._known() if parts is None else ((part, self._within(part)) for part in parts)
         return _sorted(
             item
-            for robot in (self._items if writers is None else writers)
-            for place, item in self._items.get(robot, {}).items()
-            if _newer(item.stamp, digest.get(robot, {}).get(place))
+            for part, known in chosen
+            for number, item in known.items()
+            if _newer(item.stamp, digest.get(part, {}).get(number))
         )
 
     def wants(self, digest: Digest) -> list[Key]:
         """The keys of what somebody that knows ``digest`` could tell."""
         return [
-            Key(kind, robot, number)
-            for robot, known in digest.items()
-            for (kind, number), stamp in known.items()
-            if _newer(stamp, item.stamp if (item := self._items.get(robot, {}).get((kind, number))) else None)
+            Key(part.kind, part.robot, number)
+            for part, theirs in digest.items()
+            for number, stamp in theirs.items()
+            if _newer(stamp, item.stamp if (item := self._within(part).get(number)) else None)
         ]
 
     def items(self, keys: Iterable[Key]) -> list[Item]:
         """The items of those keys that are known; topology first, maps last."""
-        found = (self._items.get(key.robot, {}).get((key.kind, key.number)) for key in keys)
+        found = (self._within(_part_of(key)).get(key.number) for key in keys)
         return _sorted(item for item in found if item is not None)
+
+    def _robots(self, kind: Kind) -> list[str]:
+        return sorted(robot for robot, of_kind in self._items if of_kind is kind)
+
+    def _read(self, robot: str, kind: Kind) -> Iterable[Record]:
+        """The records of one writer and kind, by number."""
+        if kind is Kind.MAP:
+            return (item.record for item in self.run(robot, kind))
+        if (robot, kind) not in self._records:
+            self._records[robot, kind] = tuple(item.record for item in self.run(robot, kind))
+        return self._records[robot, kind]
+
+    def _known(self) -> Iterator[tuple[Part, dict[int, Item]]]:
+        for run, blocks in self._items.items():
+            for block, known in blocks.items():
+                yield Part(*run, block), known
+
+    def _within(self, part: Part) -> Mapping[int, Item]:
+        return self._items.get((part.robot, part.kind), {}).get(part.block, {})
+
+
+def _part_of(key: Key) -> Part:
+    return Part(key.robot, key.kind, key.number // PART)
 
 
 def _newer(one: Stamp, other: Stamp | None) -> bool:

@@ -83,7 +83,7 @@ class Teammate:
 
     def judgements_between(self, robots: tuple[str, str]) -> dict[HypothesisId, Judgement]:
         """The judgements of sightings between two robots."""
-        seen = (item.record for robot in robots for item in self.store.part(robot, Kind.SIGHTING))
+        seen = (item.record for robot in robots for item in self.store.run(robot, Kind.SIGHTING))
         between = (r for r in seen if isinstance(r, SightingRecord) and r.observed in robots)
         ids = ((r.observer, r.number) for r in between)
         return {key: self.judgements[key] for key in ids if key in self.judgements}

@@ -16,9 +16,19 @@ from factors import VertexId
 from mrtm.team import messages
 from mrtm.team.codec import pack
 from mrtm.team.exchange import MOST_KEYS, Traffic, exchange, opening, receive
-from mrtm.team.messages import CHUNK, LARGEST_MESSAGE, MessageError, Stage, open_message, pack_keys, seal, unpack_keys
+from mrtm.team.messages import (
+    CHUNK,
+    LARGEST_MESSAGE,
+    MessageError,
+    Stage,
+    open_message,
+    pack_keys,
+    pack_parts,
+    seal,
+    unpack_keys,
+)
 from mrtm.team.records import Key, Kind, MapRecord, Record, VertexRecord
-from mrtm.team.store import Store, item_of
+from mrtm.team.store import Part, Store, item_of
 from tests.mrtm.record_examples import ROBOTS, record_of, room_map
 
 
@@ -87,7 +97,7 @@ def test_of_two_contents_of_one_version_everybody_keeps_the_same() -> None:
     one, two = record_of(Kind.EDGE, value=0.1), record_of(Kind.EDGE, value=0.2)
     winner = max(item_of(pack(one)).hash, item_of(pack(two)).hash)
     for order in ((one, two), (two, one), (one, two, one, two)):
-        assert store_of(*order).digest()["red"][Kind.EDGE, 3] == (0, winner)
+        assert store_of(*order).digest()[Part("red", Kind.EDGE, 0)][3] == (0, winner)
     a, b = store_of(one), store_of(two)
     exchange(a, b)
     assert same(a, b)
@@ -171,10 +181,22 @@ def test_keys_of_many_writers_go_in_several_messages() -> None:
         for number in range(MOST_KEYS // 2):
             a.put(record_of(Kind.VERTEX, f"robot{n}", number))
         b.put(record_of(Kind.VERTEX, f"robot{n}", 0))
-    asked = receive(a, seal(Stage.WRITERS, b.writers())).replies
-    assert len(asked) == 3
+    asked = receive(a, seal(Stage.PARTS, pack_parts(b.parts()))).replies
+    told = [unpack_keys(open_message(message)[1]) for _, message in asked]
+    assert [sum(map(len, digest.values())) <= MOST_KEYS for digest in told] == [True, True]
+    assert set(told[0]) | set(told[1]) == set(a.parts())
     exchange(a, b)
     assert same(a, b)
+
+
+def test_little_is_told_of_what_both_know() -> None:
+    a = store_of(*(r for robot in ROBOTS for r in everything_of(robot, 400)))
+    b = store_of(*a.records())
+    for robot in ROBOTS:
+        a.put(record_of(Kind.EDGE, robot, 400))
+    traffic = exchange(b, a)
+    assert [len(keys) for keys in traffic.learned] == [len(ROBOTS), 0]
+    assert traffic.sent["digest"] < 0.5 * len(a)
 
 
 # What goes wrong.
@@ -263,7 +285,9 @@ def test_five_robots_over_bad_links_end_alike_once_links_return(seed: int, story
             for store, old_digest in zip((robots[who], robots[whom]), before, strict=True):
                 assert {item.hash for item in store.missing({})} <= written
                 now = store.digest()
-                assert all(now[w][place] >= stamp for w, known in old_digest.items() for place, stamp in known.items())
+                assert all(
+                    now[p][number] >= stamp for p, known in old_digest.items() for number, stamp in known.items()
+                )
     line = list(pairwise(robots))
     for a, b in [*line, *line[::-1]]:  # everything to the right end, and back
         exchange(a, b)
@@ -285,7 +309,7 @@ def test_over_a_bad_link_the_rest_comes_with_the_next_meetings() -> None:
 def test_any_bytes_are_survived(noise: bytes, seed: int) -> None:
     a, b = store_of(*everything_of("red", 2)), store_of(*everything_of("blue", 2))
     before = a.digest()
-    good = [opening(b)[1], seal(Stage.WRITERS, b.writers()), seal(Stage.KEYS, pack_keys(b.digest()))]
+    good = [opening(b)[1], seal(Stage.PARTS, pack_parts(b.parts())), seal(Stage.KEYS, pack_keys(b.digest()))]
     rng = Random(seed)
     for message in (noise, *(damaged(m, rng) for m in good)):
         outcome = receive(a, message)
@@ -361,7 +385,7 @@ def test_lists_that_claim_to_be_long_are_refused() -> None:
     assert "unpacked" in receive(Store(), with_body(4, zstandard.ZstdCompressor().compress(claims))).refused[0]
 
 
-@pytest.mark.parametrize("head", [0x00, 0x21, 0x15, 0xFF])
+@pytest.mark.parametrize("head", [0x00, 0x11, 0x25, 0xFF])
 def test_another_protocol_is_refused_by_name(head: int) -> None:
     body = zstandard.ZstdCompressor().compress(msgpack.packb([]))
     message = bytes([head]) + messages._checksum(head, body) + body
@@ -375,19 +399,33 @@ def with_body(stage: int, body: bytes) -> bytes:
 
 def test_keys_come_back_with_the_beginnings_of_hashes() -> None:
     store = store_of(*everything_of("red", 5), record_of(Kind.VERTEX, "blue", 2**31 - 1, 2**31 - 1))
-    digest = store.digest(["red", "blue", "nobody"])
+    nothing = Part("nobody", Kind.EDGE, 2**20)
+    digest = store.digest([*store.parts(), nothing])
     again = unpack_keys(msgpack.unpackb(msgpack.packb(pack_keys(digest))))
     assert again == {
-        writer: {place: (version, whole[:4]) for place, (version, whole) in known.items()}
-        for writer, known in digest.items()
+        part: {number: (version, whole[:4]) for number, (version, whole) in known.items()}
+        for part, known in digest.items()
     }
+    assert again[nothing] == {}
     assert not store.missing(again)
     assert not store.wants(again)
-    assert {item.key.robot for item in store.missing({"red": again["red"]})} == {"blue"}
+    red = {part: known for part, known in again.items() if part.robot == "red"}
+    assert {item.key.robot for item in store.missing(red)} == {"blue"}
 
 
 @pytest.mark.parametrize(
-    "columns", [None, [], [1, 2, 3, 4], [b"", b"", b""], [b"\5", *[b"0000"] * 3], [b"\0", b"", b"", b""]]
+    "columns",
+    [
+        None,
+        [],
+        [1, 2, 3, 4, 5, 6],
+        [b"", b"", b"", b"", b""],
+        [b"\5", b"0000", b"\1", b"\0", b"0000", b"0000"],  # no such kind
+        [b"\0", b"", b"\1", b"\0", b"0000", b"0000"],  # no block
+        [b"\0", b"0000", b"\2", b"\0", b"0000", b"0000"],  # two are told, one is there
+        [b"\0", b"0000", b"\1", b"\0", b"00000", b"0000"],  # a version too long
+        [b"\0", b"0000", b"\1", b"\x40", b"0000", b"0000"],  # beyond the part
+    ],
 )
 def test_keys_that_are_not_columns_of_one_length_are_refused(columns: Any) -> None:
     with pytest.raises(MessageError, match="red"):
