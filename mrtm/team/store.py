@@ -94,8 +94,9 @@ class Store:
     def __init__(self) -> None:
         self._items: dict[tuple[str, Kind], dict[int, dict[int, Item]]] = {}  # by block, by number
         self._counts: Counter[Kind] = Counter()
-        self._hashes: dict[Part, bytes] = {}  # as far as they are known
-        self._summary: bytes | None = None  # likewise
+        self._hashes: dict[Part, bytes] = {}
+        self._changed: set[Part] = set()  # parts with another hash by now
+        self._summary: bytes | None = None  # if it is known
         self._runs: dict[tuple[str, Kind], tuple[Item, ...]] = {}  # those of one writer and kind, likewise
         self._records: dict[tuple[str, Kind], tuple[Record, ...]] = {}  # theirs, but for maps
 
@@ -119,7 +120,7 @@ class Store:
         known[item.key.number] = item
         self._counts[part.kind] += old is None
         self._summary = None
-        self._hashes.pop(part, None)
+        self._changed.add(part)
         self._runs.pop(run, None)
         self._records.pop(run, None)
         return True
@@ -183,10 +184,11 @@ class Store:
 
     def parts(self) -> dict[Part, bytes]:
         """For every part a hash of what is known of it."""
-        for part, known in self._known():
-            if part not in self._hashes:
-                rows = (b"%d %d " % (number, item.version) + item.hash for number, item in sorted(known.items()))
-                self._hashes[part] = hashlib.blake2b(b"".join(rows), digest_size=PART_HASH).digest()
+        while self._changed:
+            part = self._changed.pop()
+            known = sorted(self._within(part).items())
+            rows = (b"%d %d " % (number, item.version) + item.hash for number, item in known)
+            self._hashes[part] = hashlib.blake2b(b"".join(rows), digest_size=PART_HASH).digest()
         return dict(self._hashes)
 
     def digest(self, parts: Iterable[Part] | None = None) -> Digest:
