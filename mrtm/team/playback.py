@@ -76,7 +76,7 @@ class Playback:
             while told and told[0][0] <= time:
                 self._write_down(told.popleft()[1])
             with uninterrupted():
-                self._meet(time, robots)
+                self.meet(time, robots)
             report(number / len(meetings))
         for _, data in told:
             self._write_down(data)
@@ -110,8 +110,8 @@ class Playback:
             for teammate in (self.team[item.key.robot], self.listener):
                 teammate.store.add(item)
 
-    def _meet(self, time: float, robots: tuple[str, str]) -> None:
-        """M10 and M11."""
+    def meet(self, time: float, robots: tuple[str, str]) -> None:
+        """Two robots tell each other what they know, and think about it where it is due (M10, M11, M13)."""
         one, other = (self.team[robot] for robot in robots)
         before = dict(self._stages.seconds)
         with self._stages("exchange"):
