@@ -1,9 +1,9 @@
 """The edge that joins the graphs of two robots that met (M11), from all sightings between two of their vertices."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import gtsam
+import numba
 import numpy as np
 
 from factors.edge import Edge, EdgeId, EdgeKind, VertexId
@@ -52,18 +52,17 @@ def fuse_sightings(sightings: Sequence[AnchoredSighting]) -> UncertainPose | Non
         FactorError: if there is no sighting, or they are not all between the same two vertices.
     """
     tail, _ = _ends(sightings)
-    pose = _start(sightings, tail)
-    weights = [np.linalg.inv(sighting.covariance).astype(np.float64) for sighting in sightings]
-    for _ in range(_MAX_STEPS):
-        terms = None if pose is None else _linearised(sightings, weights, tail, pose)
-        if pose is None or terms is None:
-            return None
-        step = -np.sum([term.gain @ term.error for term in terms], axis=0)
-        pose = pose.compose(gtsam.Pose2.Expmap(step))
-        if float(np.abs(step).max()) < _SETTLED:
-            covariance = _covariance(sightings, tail, pose, terms)
-            return UncertainPose(pose, covariance) if covariance[2, 2] < _MAX_HEADING_SIGMA**2 else None
-    return None
+    start = _start(sightings, tail)
+    if start is None:
+        return None
+    pose = _coordinates(start)
+    back = np.array([s.observer_vertex != tail for s in sightings])
+    gains, shares = np.empty((len(sightings), 3, 3)), np.empty(len(sightings))
+    if not _gauss_newton(*_measured(sightings), back, pose, gains, shares):
+        return None
+    found = gtsam.Pose2(*pose)
+    covariance = _covariance(sightings, tail, found, gains, shares)
+    return UncertainPose(found, covariance) if covariance[2, 2] < _MAX_HEADING_SIGMA**2 else None
 
 
 def _ends(sightings: Sequence[AnchoredSighting]) -> tuple[VertexId, VertexId]:
@@ -103,44 +102,102 @@ def _start(sightings: Sequence[AnchoredSighting], tail: VertexId) -> gtsam.Pose2
     return gtsam.Pose2(x, y, turn.theta())
 
 
-class _Term(NamedTuple):
-    """What one sighting adds: ``gain`` (3, n) moves the pose by ``error`` (n,); ``share`` is its part in the pose."""
+def _measured(sightings: Sequence[AnchoredSighting]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """(n, 3) what was seen, (n, 3) the observers' and (n, 3) the observed robots' poses in their vertices, (n, 3, 3)
+    weights; without a heading the last row and column of these are zero."""
+    seen, weights = np.zeros((len(sightings), 3)), np.zeros((len(sightings), 3, 3))
+    for i, sighting in enumerate(sightings):
+        seen[i, :2], seen[i, 2] = sighting.sighting.position, sighting.sighting.heading or 0.0
+        size = len(sighting.covariance)
+        weights[i, :size, :size] = np.linalg.inv(sighting.covariance)
+    observers = np.array([_coordinates(sighting.observer.pose) for sighting in sightings])
+    observed = np.array([_coordinates(sighting.observed.pose) for sighting in sightings])
+    return seen, observers, observed, weights
 
-    gain: FloatArray
-    error: FloatArray
-    share: float
+
+@numba.njit(cache=True)
+def _gauss_newton(seen, observers, observed, weights, back, pose, gains, shares):  # type: ignore[no-untyped-def]
+    """Bring ``pose`` (3,) to the optimum; False if the sightings do not fix it.
+
+    Args:
+        back: (n,) whether the observer's vertex is the head.
+        gains: (n, 3, 3) becomes what moves the pose by each residual.
+        shares: (n,) becomes the part of each sighting in the pose.
+    """
+    by = np.empty((len(seen), 3, 3))
+    for _ in range(_MAX_STEPS):
+        information, vector = np.zeros((3, 3)), np.zeros(3)
+        for i in range(len(seen)):
+            there = _after(_back(pose) if back[i] else pose, observed[i])
+            there = _after(_back(observers[i]), there)
+            error = there - seen[i]
+            error[2] = np.pi - (np.pi - error[2]) % (2.0 * np.pi)
+            turn = np.zeros((3, 3))
+            turn[0, 0] = turn[1, 1] = np.cos(there[2])
+            turn[1, 0] = np.sin(there[2])
+            turn[0, 1], turn[2, 2] = -turn[1, 0], 1.0
+            by[i] = turn @ _adjoint(_back(observed[i]))
+            if back[i]:  # (pose Exp(xi))^-1 = pose^-1 Exp(-Ad(pose) xi)
+                by[i] = -by[i] @ _adjoint(pose)
+            gains[i] = by[i].T @ weights[i]
+            information += gains[i] @ by[i]
+            vector += gains[i] @ error
+        least, _, most = np.linalg.eigvalsh(information)
+        if not most < _MAX_CONDITION * least:
+            return False
+        covariance = np.linalg.inv(information)
+        step = -covariance @ vector
+        pose[:] = _after(pose, _exp(step))
+        if np.abs(step).max() < _SETTLED:
+            for i in range(len(seen)):
+                gains[i] = covariance @ gains[i]
+                shares[i] = np.trace(gains[i] @ by[i]) / 3.0
+            return True
+    return False
 
 
-def _linearised(
-    sightings: Sequence[AnchoredSighting], weights: Sequence[FloatArray], tail: VertexId, pose: gtsam.Pose2
-) -> list[_Term] | None:
-    """The normal equations at ``pose``, the sightings weighted by (n, n) ``weights``, solved; None if singular."""
-    rows = []
-    information = np.zeros((3, 3))
-    for sighting, weight in zip(sightings, weights, strict=True):
-        if sighting.observer_vertex == tail:
-            error, by_head = sighting.residual(pose)
-        else:  # (pose Exp(xi))^-1 = pose^-1 Exp(-Ad(pose) xi)
-            error, by_tail = sighting.residual(pose.inverse())
-            by_head = -by_tail @ pose.AdjointMap()
-        weighted = by_head.T @ weight
-        information += weighted @ by_head
-        rows.append((weighted, error, by_head))
-    if np.linalg.cond(information) > _MAX_CONDITION:
-        return None
-    covariance: FloatArray = np.linalg.inv(information).astype(np.float64)
-    return [_Term(covariance @ w, error, float(np.trace(covariance @ w @ by)) / 3.0) for w, error, by in rows]
+@numba.njit(cache=True)
+def _after(a, b):  # type: ignore[no-untyped-def]
+    """a_T_c of poses a_T_b and b_T_c."""
+    c, s = np.cos(a[2]), np.sin(a[2])
+    return np.array([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]])
+
+
+@numba.njit(cache=True)
+def _back(a):  # type: ignore[no-untyped-def]
+    c, s = np.cos(a[2]), np.sin(a[2])
+    return np.array([-c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]])
+
+
+@numba.njit(cache=True)
+def _adjoint(a):  # type: ignore[no-untyped-def]
+    c, s = np.cos(a[2]), np.sin(a[2])
+    return np.array([[c, -s, a[1]], [s, c, -a[0]], [0.0, 0.0, 1.0]])
+
+
+@numba.njit(cache=True)
+def _exp(tangent):  # type: ignore[no-untyped-def]
+    half = 0.5 * tangent[2]
+    sinc = np.sin(half) / half if abs(half) > 1e-9 else 1.0
+    a, b = sinc * np.cos(half), half * sinc * sinc
+    return np.array([a * tangent[0] - b * tangent[1], b * tangent[0] + a * tangent[1], tangent[2]])
 
 
 def _covariance(
-    sightings: Sequence[AnchoredSighting], tail: VertexId, pose: gtsam.Pose2, terms: Sequence[_Term]
+    sightings: Sequence[AnchoredSighting], tail: VertexId, pose: gtsam.Pose2, gains: FloatArray, shares: FloatArray
 ) -> FloatArray:
     """(3, 3) in the frame of head: the sensor's noise through the gains, and the displacement of either vertex once."""
     sensor = np.zeros((3, 3))
     shifts = np.zeros((2, 3, 3))
-    for sighting, term in zip(sightings, terms, strict=True):
-        sensor += term.gain @ sighting.sighting.covariance @ term.gain.T
+    for sighting, gain, share in zip(sightings, gains, shares, strict=True):
+        covariance = sighting.sighting.covariance
+        through = gain[:, : len(covariance)]
+        sensor += through @ covariance @ through.T
         for shift, anchor in zip(shifts, _anchors(sighting, tail), strict=True):
-            shift += term.share * adjoint_transport(*anchor)
+            shift += share * adjoint_transport(*anchor)
     sensor += adjoint_transport(pose.inverse(), shifts[0]) + shifts[1]
     return sensor
+
+
+def _coordinates(pose: gtsam.Pose2) -> FloatArray:
+    return np.array([pose.x(), pose.y(), pose.theta()])

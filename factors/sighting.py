@@ -107,6 +107,7 @@ class AnchoredSighting:
         sighting: the measurement.
         observer_vertex, observed_vertex: the vertices the two robots were in.
         observer, observed: vertex_T_robot of either, (3, 3) covariance in the frame of the robot; it may be singular.
+        covariance: of ``residual``: sensor and both anchors, (2, 2), or (3, 3) where the heading was measured.
 
     Raises:
         FactorError: if an anchor is not finite or its covariance not positive semidefinite.
@@ -117,15 +118,15 @@ class AnchoredSighting:
     observed_vertex: VertexId
     observer: UncertainPose
     observed: UncertainPose
+    covariance: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         for name in ("observer", "observed"):
             checked = check_pose_covariance(getattr(self, name), f"sighting, {name}")
             object.__setattr__(self, name, checked)
+        object.__setattr__(self, "covariance", self._covariance())
 
-    @property
-    def covariance(self) -> FloatArray:
-        """Of ``residual``: sensor and both anchors, (2, 2), or (3, 3) where the heading was measured."""
+    def _covariance(self) -> FloatArray:
         covariance = self.sighting.covariance.copy()
         x, y = self.sighting.position.tolist()
         heading = self.sighting.heading
