@@ -112,7 +112,9 @@ class JointGraph:
         with self._all_or_nothing():
             self._apply(list(add), list(replace), set(remove), set(remove_vertices))
 
-    def merge(self, other: "JointGraph", bridge: GraphEdge, edges: Iterable[GraphEdge] = ()) -> None:
+    def merge(
+        self, other: "JointGraph", bridge: GraphEdge, edges: Iterable[GraphEdge] = (), *, more: bool = False
+    ) -> None:
         """Take in another component, which stays as it is: all of it or, on an error, nothing.
 
         The vertices of ``other`` keep their estimates relative to each other; ``bridge`` places them. Its edges come
@@ -121,14 +123,15 @@ class JointGraph:
         Args:
             other: a component without a vertex or an edge id of this one; its prior is left behind.
             bridge: an edge that fixes a pose, from one component to the other, either way.
-            edges: more new ones, between any of the vertices, judged as in ``update`` when the bridge is in.
+            edges: other new ones, between any of the vertices, judged as in ``update`` when the bridge is in.
+            more: the estimate need not be at the optimum yet: more changes follow, an ``update`` in the end.
 
         Raises:
             GraphError: the components share a vertex or an edge id, ``bridge`` does not join them, one of ``edges``
                 cannot be added, or the equations cannot be solved.
         """
         with self._all_or_nothing():
-            self._absorb(other, bridge, list(edges))
+            self._absorb(other, bridge, list(edges), more)
 
     def optimize_fully(self) -> None:
         """Bring the estimate to the optimum to the last digit, for the end of a run."""
@@ -274,7 +277,7 @@ class JointGraph:
             judged += self._needed()
         self._solve({}, judged, made, believed)
 
-    def _absorb(self, other: "JointGraph", bridge: GraphEdge, edges: list[GraphEdge]) -> None:
+    def _absorb(self, other: "JointGraph", bridge: GraphEdge, edges: list[GraphEdge], more: bool) -> None:
         """Stage the union of two components, check it, and solve it."""
         for name in sorted(map(str, (*(other._keys.keys() & self._keys), *(other._edges.keys() & self._edges)))):
             raise GraphError(f"{name} is in both components: they cannot be merged")
@@ -291,7 +294,7 @@ class JointGraph:
         self._doubted |= other._doubted
         self._place(edges, made)
         settled = {edge.id: self._factor(edge) for edge in (bridge, *other._believed())}
-        self._solve(settled, edges, made, set())
+        self._solve(settled, edges, made, set(), more)
 
     def _solve(
         self,
@@ -299,8 +302,9 @@ class JointGraph:
         judged: list[GraphEdge],
         made: dict[VertexId, gtsam.Pose2],
         out: set[EdgeId],
+        more: bool = False,
     ) -> None:
-        """Bring a staged change to the optimum.
+        """Bring a staged change to the optimum, or near it if more follow.
 
         Args:
             settled: factors that come as they are.
@@ -323,7 +327,8 @@ class JointGraph:
         self._doubted |= late
         if out or any(edge.kind not in CERTAIN for edge in judged):
             self._doubts.settle(self._equations(), late)
-        self._smoother.come_to_rest()
+        if not more:
+            self._smoother.come_to_rest()
 
     def _strained(
         self, settled: Iterable[EdgeId], judged: list[GraphEdge], made: dict[VertexId, gtsam.Pose2], taken: bool

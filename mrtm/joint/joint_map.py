@@ -209,8 +209,8 @@ class JointMap:
             edges = (*fused.values(), *added.values())
             bridge = next(e for e in edges if e.estimate and _ends(e) & reached and _ends(e) - reached)
             both = reached | _ends(bridge)
-            more = [e for e in fused.values() if e is not bridge and _ends(e) <= both and not _ends(e) <= reached]
-            graph.merge(self._own[(both - reached).pop()], bridge, more)
+            rest = [e for e in fused.values() if e is not bridge and _ends(e) <= both and not _ends(e) <= reached]
+            graph.merge(self._own[(both - reached).pop()], bridge, rest, more=True)
             reached = both
         known = {edge.id for edge in graph.edges()}
         graph.update(add=[e for i, e in added.items() if i not in known])
