@@ -8,6 +8,7 @@ import numpy as np
 
 from factors import GraphEdge, VertexId
 from mrtm.config import Config
+from mrtm.joint.alignment.warm_up import warm_up
 from mrtm.joint.bending import BentMap
 from mrtm.joint.graph import JointGraph
 from mrtm.joint.sightings.consistency import Verdict
@@ -71,6 +72,7 @@ class Playback:
         """All meetings, and what the listener makes of it all in the end."""
         meetings = _meetings(self._sightings, self._config.team.exchange_interval)
         seen = [(s.time, pack(s)) for s in self._sightings]
+        warm_up()
         told = deque(heapq.merge(*(run.told for run in self._runs), seen, key=lambda item: item[0]))
         for number, (time, robots) in enumerate(meetings):
             while told and told[0][0] <= time:

@@ -1,6 +1,8 @@
 """Two maps of a made-up room: alignment must find how they lie, say how sure it is, and refuse what is wrong."""
 
 import ctypes
+import subprocess
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -212,3 +214,18 @@ def cloud(points: FloatArray, normals: FloatArray) -> Any:
     found.points = open3d().utility.Vector3dVector(np.column_stack([points, flat]))
     found.normals = open3d().utility.Vector3dVector(np.column_stack([normals, flat]))
     return found
+
+
+KERNELS_OF_ALIGNMENT = """
+from mrtm.joint.alignment import agreement, candidates, correlative, icp, surface, warm_up
+kernels = [agreement._count, agreement._known, agreement._sort, candidates._near, correlative._draw, correlative._score,
+           icp._round, surface._partners]
+assert not any(kernel.signatures for kernel in kernels)
+warm_up.warm_up()
+assert all(kernel.signatures for kernel in kernels), [kernel for kernel in kernels if not kernel.signatures]
+"""
+
+
+def test_after_warming_up_all_kernels_are_there() -> None:
+    """In a process of their own: other tests have them read."""
+    subprocess.run([sys.executable, "-c", KERNELS_OF_ALIGNMENT], check=True)
