@@ -12,9 +12,8 @@ from frontend.points import Points, merge
 from frontend.rbpf import ParticleFilter
 from frontend.records import FloatArray
 from frontend.refine import localise, refine
-from frontend.tracking import REVERSED, Step
+from frontend.tracking import OPPOSITE, Step
 
-PATIENCE = 2.5  # times the usual distance between key scans
 SOFTNESS = 0.06  # difference of two scores that makes one hypothesis e times likelier than the other
 SPREAD = np.diag([0.03**2, 0.03**2, 0.01**2])  # covariance of the particles around their hypothesis
 
@@ -51,6 +50,7 @@ class LocalSlam:
         self.filter = ParticleFilter(parameters, seed)
         self._points: list[Points] = []
         self._increments: list[FloatArray] = []
+        self._forward: list[bool] = []  # whether these have the right sign
         self._offsets: list[FloatArray] = []  # pose seen from that at the key scan before
         self._keys: list[int] = []  # which step of the filter that was
         self._steps = 0
@@ -75,7 +75,7 @@ class LocalSlam:
         if not again:
             self._entrance = poses[0].copy()
         self.filter.start(poses, known, points)
-        self._points, self._increments = [points], [np.zeros(3)]
+        self._points, self._increments, self._forward = [points], [np.zeros(3)], [self.filter.tracker.forward]
         self._offsets, self._keys, self._steps, self._resampled = [np.zeros(3)], [0], 0, 0
         self._localised = np.empty((0, 3))
         if self._mapping:
@@ -99,14 +99,17 @@ class LocalSlam:
         p = self.parameters
         step = self.filter.track(points, increment)
         points = step.points
-        offset = se2.between(self.filter.poses[self.filter.leader], step.pose)
-        # While it is open which way the robot drives, drawing waits a little.
-        patience = PATIENCE if self.filter.doubt > 0.5 * REVERSED else 1.0
-        if np.hypot(offset[0], offset[1]) >= patience * p.key_distance or abs(offset[2]) >= patience * p.key_angle:
+        at_key = self.filter.poses[self.filter.leader]
+        for back, pose in enumerate(step.retraced[::-1], 1):
+            self._offsets[-back], self._forward[-back] = se2.between(at_key, pose), step.forward
+        offset = se2.between(at_key, step.pose)
+        moved = np.hypot(offset[0], offset[1]) >= p.key_distance or abs(offset[2]) >= p.key_angle
+        if moved and not self.filter.tracker.undecided:
             self._update(points)
             offset = np.zeros(3)
         self._points.append(points)
         self._increments.append(increment)
+        self._forward.append(step.forward)
         self._offsets.append(offset)
         self._keys.append(self._steps)
         return step
@@ -143,8 +146,9 @@ class LocalSlam:
         return a.poses[0], a.covariances[0]
 
     def _odometry(self) -> tuple[FloatArray, FloatArray]:
-        """(n, 3) increments and their variances."""
+        """(n, 3) increments, as far as is known with the right sign, and their variances."""
         increments = np.array(self._increments)
+        increments[~np.array(self._forward)] *= OPPOSITE
         return increments, np.array([motion.variance(i, self.parameters.motion) for i in increments])
 
     def covariance(self) -> FloatArray:
@@ -174,8 +178,12 @@ class LocalSlam:
         """Scans of the visit so far."""
         return len(self._points)
 
-    def scans(self) -> list[tuple[Points, FloatArray]]:
-        """The visit's scans with the odometry increments that led to them, to take them elsewhere."""
+    def take_back(self) -> list[tuple[Points, FloatArray]]:
+        """The visit's scans with the odometry increments that led to them, as recorded, to take them anew.
+
+        What the visit has found out about the sign of odometry is forgotten with it.
+        """
+        self.filter.tracker.forward = self._forward[0]
         return list(zip(self._points, self._increments, strict=True))
 
     def _update(self, points: Points) -> None:

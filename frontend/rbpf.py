@@ -114,7 +114,7 @@ class ParticleFilter:
         self._history: list[tuple[FloatArray, npt.NDArray[np.int64]]] = []
         self.resampled = 0
         self.leader = 0
-        self._tracker = Tracker(parameters)
+        self.tracker = Tracker(parameters)
 
     def start(self, poses: FloatArray, known: Maps | None = None, scan: Points | None = None) -> None:
         """Begin a local map: M1 and M7a with ``poses`` all zero and nothing known; M3's re-entry with the poses drawn
@@ -135,9 +135,9 @@ class ParticleFilter:
         self._covariances[:] = 0.0
         self._history = [(self.poses.copy(), np.arange(count))]
         self.leader = 0
-        self._tracker.rest(self.poses[0].copy())
+        self.tracker.rest(self.poses[0].copy())
         if scan is not None:
-            self._tracker.movers.start(scan)
+            self.tracker.movers.start(scan)
 
     @property
     def weights(self) -> FloatArray:
@@ -147,12 +147,7 @@ class ParticleFilter:
 
     def track(self, points: Points, increment: FloatArray) -> Step:
         """Follow the best particle over one odometry ``increment`` (3,) by matching ``points`` to its map."""
-        return self._tracker.track(self.maps.layers(self.leader), points, increment)
-
-    @property
-    def doubt(self) -> float:
-        """Log-likelihood by which odometry of the opposite sign explains the last scans better."""
-        return self._tracker.doubt
+        return self.tracker.track(self.maps.layers(self.leader), points, increment)
 
     def update(self, points: Points, mapping: bool) -> None:
         """One filter step on a key scan: propose, weigh, resample, map. ``track`` has been called for it before.
@@ -161,13 +156,13 @@ class ParticleFilter:
         """
         p = self.parameters
         self._steps += 1
-        priors = se2.compose(self.poses, self._tracker.motion)
-        moved = se2.between(self.poses[self.leader], self._tracker.pose)
+        priors = se2.compose(self.poses, self.tracker.motion)
+        moved = se2.between(self.poses[self.leader], self.tracker.pose)
         self.poses = se2.compose(self.poses, moved)
-        if np.any(self._tracker.variances > 0.0):
+        if np.any(self.tracker.variances > 0.0):
             _propose(
                 self.maps.log_odds, self.maps.index, self.maps.surfels, self.maps.resolution, points.hits, priors,
-                self._tracker.variances, p.independence, p.sigma, self._seed, self._steps, self.poses,
+                self.tracker.variances, p.independence, p.sigma, self._seed, self._steps, self.poses,
                 self._log_weights, self._covariances,
             )  # fmt: skip
             self.poses[:, 2] = se2.wrap(self.poses[:, 2])
@@ -177,7 +172,7 @@ class ParticleFilter:
         self._history.append((self.poses.copy(), parents))
         if mapping:
             self.insert(points, self.poses)
-        self._tracker.rest(self.poses[self.leader].copy())
+        self.tracker.rest(self.poses[self.leader].copy())
 
     def insert(self, points: Points, poses: FloatArray) -> None:
         """Add a scan to every particle's map, at ``poses`` (particles, 3)."""

@@ -4,7 +4,7 @@ Public logs have stretches of reverse driving recorded as forward, or the other 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -21,6 +21,7 @@ GOOD_FIT = 0.75  # a match that explains less than this of the known space, or
 GOOD_KNOWN = 0.25  # that has less than this in known space, is searched around
 CLOSE = 1.5  # metres within which a body can hide so much that all else fits badly
 LOST_FIT = 0.45  # below this also far around
+TURN = 0.08  # radians between the headings from which to match where odometry has the robot
 MARGIN = 0.05  # by how much a searched match must beat the plain one
 OPPOSITE = np.array([-1.0, -1.0, 1.0])
 HOLD = 0.7  # metres driven under the opposite sign without a scan that speaks for it, after which it is given up
@@ -46,6 +47,7 @@ class Step:
         searched: 0 if the plain match was good; 1 or 2 for a search around or far around the expected pose.
         reversed: odometry was found to have changed its sign,
         forward: and whether it has the right one now.
+        retraced: (k, 3) where the robot then was at the k scans before: already there it had the new sign.
     """
 
     pose: FloatArray
@@ -57,6 +59,7 @@ class Step:
     searched: int = 0
     reversed: bool = False
     forward: bool = True
+    retraced: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
 
 
 class Tracker:
@@ -66,13 +69,14 @@ class Tracker:
         pose: (3,) local_T_robot at the last scan.
         motion: (3,) what odometry says of the way since the tracker was last told where it is,
         variances: (3,) and of that the variances.
+        forward: odometry has the right sign, as far as is known.
         doubt: log-likelihood by which the opposite sign explains the last scans better.
         movers: what has moved since the scans before.
     """
 
     def __init__(self, parameters: FilterParameters) -> None:
         self._parameters = parameters
-        self._sign = np.ones(3)
+        self.forward = True
         self._unsure = 0.0  # metres driven under the opposite sign since a scan last spoke for it
         self.movers = Movers()
         self.rest(np.zeros(3))
@@ -81,7 +85,16 @@ class Tracker:
         """The robot is at ``pose`` (3,), as far as the filter knows."""
         self.pose = pose
         self.motion, self.variances, self.doubt = np.zeros(3), np.zeros(3), 0.0
-        self._mirror, self._mirror_motion = pose, np.zeros(3)
+        self._start_mirror()
+
+    def _start_mirror(self) -> None:
+        """Let the second track go on from where the first is."""
+        self._mirrored, self._mirror_motion = [self.pose], self.motion
+
+    @property
+    def undecided(self) -> bool:
+        """Whether it is open which way the robot drives, and a few more scans will tell: drawing waits for them."""
+        return self.doubt >= REVERSED / REVERSED_SCANS and len(self._mirrored) <= 2 * REVERSED_SCANS
 
     def track(self, layers: Layers, points: Points, increment: FloatArray) -> Step:
         """Follow the robot over one odometry ``increment`` (3,) by matching ``points`` to its map.
@@ -89,32 +102,35 @@ class Tracker:
         A second track runs along under the opposite sign of the odometry; where it has explained the scans better for
         a while, it becomes the first.
         """
-        increment = increment * self._sign
+        increment = increment * (1.0 if self.forward else OPPOSITE)
         added = motion.variance(increment, self._parameters.motion)
         self.variances += added
         step, merit = self._follow(layers, points, self.pose, increment, added)
         self.motion = se2.compose(self.motion, increment)
         turned_over = False
         if abs(increment[0]) + abs(increment[1]) < STILL:
-            self._mirror = se2.compose(self._mirror, increment)
+            self._mirrored.append(se2.compose(self._mirrored[-1], increment))
             self._mirror_motion = se2.compose(self._mirror_motion, increment)
         else:
-            mirrored, mirrored_merit = self._follow(layers, points, self._mirror, increment * OPPOSITE, added)
-            self._mirror, self._mirror_motion = mirrored.pose, se2.compose(self._mirror_motion, increment * OPPOSITE)
+            mirrored, mirrored_merit = self._follow(layers, points, self._mirrored[-1], increment * OPPOSITE, added)
+            self._mirrored.append(mirrored.pose)
+            self._mirror_motion = se2.compose(self._mirror_motion, increment * OPPOSITE)
             # One scan proves little: its time may be off by a good part of the way driven. Nor does a bare corridor, or
-            # what of a scan lies in known space where that ends.
+            # what of a scan lies in known space where that ends. The wrong one may have little to hold on to.
             comparable = min(step.known, mirrored.known)
-            evidence = comparable * _grip(step, increment) * (mirrored_merit - merit)
+            grip = max(_grip(step, increment), _grip(mirrored, increment))
+            evidence = comparable * grip * (mirrored_merit - merit)
             self.doubt = max(0.0, self.doubt + min(evidence, REVERSED / REVERSED_SCANS))
             # A wrong sign is the exception: it is held only as long as the scans go on saying so.
-            held = self._sign[0] < 0.0 and evidence > -1.0
+            held = not self.forward and evidence > -1.0
             self._unsure = self._unsure + float(np.hypot(increment[0], increment[1])) if held else 0.0
             turned_over = self.doubt >= REVERSED or self._unsure > HOLD
             if turned_over:
                 self._unsure = 0.0
-                self._sign = self._sign * OPPOSITE
+                self.forward = not self.forward
                 self.motion, self.doubt = self._mirror_motion, 0.0
                 step = mirrored
+                step.retraced = np.array(self._mirrored[1:-1]).reshape(-1, 3)
         if len(points.hits) >= MIN_POINTS and not _good(step):
             step = self._search(layers, points, se2.compose(self.pose, increment), increment, step)
         followed = not step.searched and not turned_over
@@ -131,10 +147,10 @@ class Tracker:
                     step.pose, step.hessian, step.points = again.pose, again.hessian, standing
         if not followed:
             self.movers.start(points)
-        step.reversed, step.forward = turned_over, bool(self._sign[0] > 0.0)
+        step.reversed, step.forward = turned_over, self.forward
         self.pose = step.pose
         if self.doubt == 0.0:
-            self._mirror, self._mirror_motion = step.pose, self.motion
+            self._start_mirror()
         return step
 
     def _follow(
@@ -184,8 +200,12 @@ class Tracker:
                 *layers, points.hits, prior, reach_xy, 0.15, reach_theta, 0.04, information, stride,
                 peaks, np.empty(12),
             )  # fmt: skip
-            for k in range(found):
-                step = self._match(layers, points, peaks[k].copy(), prior, information * 0.1)
+            # The lattice is coarse beside the width of a surface, and a few centimetres aside it may miss the best. A
+            # turn that odometry missed is the commonest error, and there matches from turned headings are dense enough.
+            turns = np.arange(TURN, reach_theta, TURN)
+            turned_aside = prior + np.outer(np.concatenate((turns, -turns)), [0.0, 0.0, 1.0])
+            for start in np.vstack((turned_aside, peaks[:found])):
+                step = self._match(layers, points, start, prior, information * 0.1)
                 step.searched = level
                 if merit(step) > merit(best) + MARGIN:
                     best = step

@@ -222,12 +222,16 @@ def _explain(error: ValidationError, given: Mapping[str, _Given]) -> str:
     first = errors[0]
     path = [str(part) for part in first["loc"]]
     cause = first.get("ctx", {}).get("error")
+    value = first.get("input")
     if isinstance(cause, ParameterError):
-        key, complaint = ".".join([*path, cause.name]), cause.complaint
+        key, complaint, value = ".".join([*path, cause.name]), cause.complaint, cause.value
     else:
         # Of a value that may be of several types there is an error for each, its path ending with the type.
         key = ".".join(path if ".".join(path) in _TYPES else path[:-1])
         same = [e["msg"] for e in errors if ".".join(map(str, e["loc"])).startswith(key)]
         complaint = " or ".join(same).replace("Input should", "must", 1).replace("Input should ", "")
-    item = given.get(key) or _Given(first.get("input"), "configuration")
+    # A bound may be on several together: one of the others was given, the last in the section more likely than not.
+    section = key.rpartition(".")[0]
+    others = [item.source for name, item in given.items() if name.startswith(f"{section}.")]
+    item = given.get(key) or _Given(value, others[-1] if others else "configuration")
     return f"{item.source}: {key} is {shorten(repr(item.value))}: {complaint}"

@@ -171,7 +171,7 @@ class Trial:
 
     def _restart(self, slam: LocalSlam, start: FloatArray) -> None:
         """Take the scans so far again, the first of them at ``start``."""
-        scans = slam.scans()
+        scans = slam.take_back()
         slam.begin(scans[0][0], slam.particles(start, SPREAD), self.candidate.maps, mapping=False)
         self.fits.clear()
         self.knowns.clear()

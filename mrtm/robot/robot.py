@@ -152,7 +152,9 @@ class Robot:
             # The edge that this visit made (M8): its measurement, with the pose as it is known now.
             kind, fused = EdgeKind.LOOP, measured
         else:
-            kind, fused = EdgeKind.COVARIANCE_INTERSECTION, fuse(edge.estimate, measured, self.config.topology.omega)
+            # A loop that is met again may still be of two places that look alike.
+            kind = EdgeKind.LOOP if edge.kind is EdgeKind.LOOP else EdgeKind.COVARIANCE_INTERSECTION
+            fused = fuse(edge.estimate, measured, self.config.topology.omega)
         newer = Edge(edge.id, edge.version + 1, kind, edge.tail, edge.head, fused.pose, fused.covariance)
         self.topology.put(newer)
         with self._stages("joint map"):
@@ -229,7 +231,7 @@ class Robot:
             self._reenter(trial, reason)
             return
         self._tell("re-entry refused", vertex=str(trial.candidate.vertex.id), reason=reason)
-        scans = self._slam.scans()
+        scans = self._slam.take_back()
         if trial.resume:
             self._resume(trial.left, scans[0][0], trial.first_scan)
         else:

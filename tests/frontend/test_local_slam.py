@@ -108,9 +108,27 @@ def test_a_submap_is_what_several_scans_saw() -> None:
     index = in_rows(walls.index[0])
     cells = (submap.hits[:, :2] / walls.resolution + len(index) / 2).astype(int)
     assert (index[cells[:, 1], cells[:, 0]] > 0).mean() > 0.97
-    scans = slam.scans()
+    scans = slam.take_back()
     assert [scan for scan, _ in scans] == points[:50]
     np.testing.assert_array_equal([increment for _, increment in scans[1:]], increments[1:50])
+
+
+def test_where_odometry_has_the_wrong_sign_the_path_is_right_from_the_first_such_scan_on() -> None:
+    log, points, increments = drive()
+    wrong = increments.copy()
+    wrong[30:60, :2] *= -1.0
+    slam = LocalSlam(PARAMETERS, 0)
+    slam.begin(points[0], STILL)
+    steps = [slam.add(scan, increment) for scan, increment in zip(points[1:60], wrong[1:60], strict=True)]
+    (found,) = np.flatnonzero([step.reversed for step in steps])
+    assert 30 < found + 1 < 45
+    assert len(steps[found].retraced) >= 3
+    off = se2.between(se2.between(log.poses[0], log.poses[:60]), slam.path())
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 0.05
+    assert not slam.filter.tracker.forward
+    taken_back = slam.take_back()
+    np.testing.assert_array_equal([increment for _, increment in taken_back[1:]], wrong[1:60])
+    assert slam.filter.tracker.forward  # as at the beginning
 
 
 MANY = FilterParameters(particles=4000, map_width=1.0)

@@ -93,6 +93,12 @@ def test_a_wrong_option_is_named(option: str, said: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_bound_on_several_values_together_names_what_was_given_and_the_value() -> None:
+    said = r"--set frontend\.particles=10000: frontend\.map_width is 70\.0: with 10000 particles"
+    with pytest.raises(ConfigError, match=said):
+        load_config(options=["seed=1", "frontend.particles=10000"])
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -144,7 +144,7 @@ class Slam:
     def submap(self, count: int) -> None:
         assert count > 1
 
-    def scans(self) -> list[tuple[None, FloatArray]]:
+    def take_back(self) -> list[tuple[None, FloatArray]]:
         return [(None, increment) for increment in np.vstack([np.zeros((1, 3)), np.tile([0.3, 0.0, 0.0], (10, 1))])]
 
     def particles(self, pose: FloatArray, covariance: FloatArray) -> FloatArray:
