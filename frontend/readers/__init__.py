@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from typing import Protocol, cast
 
@@ -17,6 +18,8 @@ from frontend.readers.lines import read_blocks
 from frontend.readers.report import Report
 from frontend.readers.scans import Record
 from frontend.records import LaserScan
+
+CHECKED = 8  # blocks, of a file of no known format: more than bzip2 unpacks before it finds damage
 
 __all__ = ["Log", "Record", "Report", "open_log"]
 
@@ -84,6 +87,10 @@ def open_log(path: Path) -> Log:
     for reader in formats:
         if reader.sniff(head):
             return Log(path, reader.NAME, reader)
+    for _ in islice(blocks, CHECKED):
+        pass
+    if report.damage:  # nonsense comes of that, too
+        raise LogError(f"{path}: {report.damage}")
     known = ", ".join(reader.NAME for reader in formats)
     raise LogError(f"{path}: not a log of a known format ({known}, plain or compressed with gzip, bzip2 or xz)")
 

@@ -1,6 +1,7 @@
 """Bytes and lines of a file, compressed or not, in memory that does not grow with the file or with a line."""
 
 import bz2
+import codecs
 import gzip
 import lzma
 import os
@@ -36,6 +37,8 @@ def read_blocks(path: Path, report: Report) -> Iterator[bytes]:
     Raises:
         LogError: the file cannot be opened or read from the disk.
     """
+    if path.exists() and not path.is_file():
+        raise LogError(f"{path}: is a pipe or a device, not a file; save it first")
     try:
         file = path.open("rb")
     except OSError as error:
@@ -73,6 +76,8 @@ def split_lines(blocks: Iterator[bytes], report: Report) -> Iterator[tuple[int, 
     tail = b""
     overlong = False
     for block in blocks:
+        if number == 0 and not tail:
+            block = block.removeprefix(codecs.BOM_UTF8)
         lines = (tail + block).split(b"\n")
         tail = lines.pop()
         for line in lines:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 EXAMPLES_KEPT = 10
 NAMES_KEPT = 50
+MOST_JUMPS = 0.1  # of the scans: more are no faults of a counter
 _NAME = re.compile(r"[A-Za-z][\w.-]{0,39}", re.ASCII)
 
 
@@ -24,6 +25,7 @@ class Report:
         skipped: lines that could not be used; the first ten are in ``skipped_examples`` as (line number, reason).
         duplicates: scans skipped because they repeat the scan before them.
         backward_steps: times the clock stepped back from one scan to the next.
+        jumps: times the odometry jumped farther than a robot can drive; the first as (line number, metres).
         other_lasers: scans of lasers of the same log that were not read, by message name.
         readings: ranges read.
         masked: of these, unusable ones (NaN, negative, zero).
@@ -43,6 +45,8 @@ class Report:
     skipped_examples: list[tuple[int, str]] = field(default_factory=list)
     duplicates: int = 0
     backward_steps: int = 0
+    jumps: int = 0
+    first_jump: tuple[int, float] = (0, 0.0)
     other_lasers: Counter[str] = field(default_factory=Counter)
     readings: int = 0
     masked: int = 0
@@ -66,6 +70,12 @@ class Report:
         self.skipped += 1
         if len(self.skipped_examples) < EXAMPLES_KEPT:
             self.skipped_examples.append((line, reason))
+
+    def jump(self, line: int, metres: float) -> None:
+        """Count a jump of the odometry."""
+        self.jumps += 1
+        if self.jumps == 1:
+            self.first_jump = line, metres
 
     def count_unknown(self, line: int, word: bytes) -> None:
         """Count a line of a message this project does not read, or skip it if ``word`` is no message's name."""
@@ -91,6 +101,13 @@ class Report:
             found.append(f"{self.path}: skipped {_number(self.duplicates, 'repeated scan')}")
         if self.backward_steps:
             found.append(f"{self.path}: the clock steps back {_number(self.backward_steps, 'time')}")
+        if self.jumps:
+            line, metres = self.first_jump
+            unit = "; is it in metres?" if self.jumps > MOST_JUMPS * self.scans else ""
+            found.append(
+                f"{self.place(line)}: odometry jumps by {metres:.0f} m, farther than a robot drives between two scans: "
+                f"taken as no motion, {_number(self.jumps, 'time')}{unit}"
+            )
         if self.masked:
             share = 100.0 * self.masked / max(self.readings, 1)
             found.append(f"{self.path}: masked {_number(self.masked, 'unusable range')} ({share:.2g} %)")

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from frontend.errors import LogError
+from frontend.readers.continuity import Continuity
 from frontend.readers.report import Report
 from frontend.readers.tags import find_tags
 from frontend.records import FloatArray, Laser, LaserScan, Sighting
@@ -19,6 +20,7 @@ FARTHEST_WALL = 50.0
 # The top codes of a SICK LMS telegram mean "no return"; with 13, 14 and 15 bits in millimetres these are, in metres:
 SICK_NO_RETURN = ((8.18, 8.195), (16.37, 16.385), (32.755, 32.77))
 FARTHEST_ODOMETRY = 1e6
+LATEST = 1e12
 # More beams are no laser's; what is held back at the start is bounded by this.
 MOST_BEAMS = 1 << 13
 # Scans held back at the start, to learn the mount and the no-return reading from more than one of them.
@@ -62,6 +64,7 @@ def assemble(raw: Iterable[RawScan], report: Report) -> Iterator[Record]:
     """Turn the raw scans of one laser into laser scans, in file order, each followed by the sightings in it.
 
     Skipped and counted: a scan with odometry or time that is not finite, and one that repeats the scan before it.
+    Odometry that jumps farther than a robot can drive is counted, and goes on from where it was.
     The first scans (100, or up to 1000 until the robot has turned by 0.2 rad) are held back to settle two things:
 
     - The mount is the laser's pose seen from the robot's, if the lines give both, the difference is the same in
@@ -92,6 +95,7 @@ def assemble(raw: Iterable[RawScan], report: Report) -> Iterator[Record]:
         f"nothing hit from {max_range:g} m, mounted at ({', '.join(f'{v:.4g}' for v in laser.mount)})"
     )
     previous = first[0].time
+    continuity = Continuity(report)
     for scan in chain(first, scans):
         if len(scan.ranges) != beams:
             raise LogError(
@@ -109,7 +113,7 @@ def assemble(raw: Iterable[RawScan], report: Report) -> Iterator[Record]:
         report.first_time = min(scan.time, report.first_time) if report.scans > 1 else scan.time
         report.last_time = max(scan.time, report.last_time) if report.scans > 1 else scan.time
         ranges = _masked(scan.ranges, max_range, report)
-        yield LaserScan(scan.time, ranges, scan.odometry, laser)
+        yield LaserScan(scan.time, ranges, continuity.joined(scan.line, scan.time, scan.odometry), laser)
         if scan.bright is not None:
             for sighting in find_tags(scan.time, ranges, scan.bright, laser):
                 report.sightings += 1
@@ -132,8 +136,8 @@ def _usable(raw: Iterable[RawScan], report: Report) -> Iterator[RawScan]:
         if not (abs(x) < FARTHEST_ODOMETRY and abs(y) < FARTHEST_ODOMETRY and abs(theta) < FARTHEST_ODOMETRY):
             report.skip(scan.line, f"odometry ({x:g}, {y:g}, {theta:g}) is not a pose")
             continue
-        if not np.isfinite(scan.time):
-            report.skip(scan.line, f"time {scan.time} is not a time")
+        if not abs(scan.time) < LATEST:
+            report.skip(scan.line, f"time {scan.time:g} is not a time in seconds")
             continue
         if (
             previous is not None

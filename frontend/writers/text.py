@@ -31,7 +31,7 @@ def new_text(path: Path) -> Iterator[TextIO]:
         os.replace(part, path)
     except BaseException as error:
         part.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename == str(part):
+        if isinstance(error, OSError) and error.filename in (None, str(part)):  # none of a full disk
             error.filename = str(path)
         raise
 

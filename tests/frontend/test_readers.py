@@ -3,6 +3,7 @@
 import bz2
 import gzip
 import lzma
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -166,6 +167,7 @@ def test_lines_are_numbered_across_blocks(tmp_path: Path) -> None:
     assert [number for number, _ in log.report.skipped_examples] == [LOG.count("\n") + many + 1]
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     def peak(count: int) -> int:
         rows = (f"FLASER 50 {'1.25 ' * 50}0 0 0 {i} 0 0 {i} host 0\n" for i in range(count))
@@ -196,3 +198,54 @@ def test_real_logs(data: Path, name: str, count: int, beams: int, backward: int,
     assert scan.laser.max_range == 50.0
     np.testing.assert_array_equal(scan.laser.mount, 0.0)
     assert scan.laser.angles[0] == pytest.approx(-np.pi / 2)
+
+
+def test_odometry_that_jumps_farther_than_a_robot_drives_goes_on_from_where_it_was(tmp_path: Path) -> None:
+    """Once there and back, and once for good; a jump that a clock at rest may explain is left as it is."""
+    way = [0.1 * i for i in range(40)]
+    told = [x + 2e4 * (i == 10) + 500.0 * (i >= 20) + 15.0 * (i >= 30) for i, x in enumerate(way)]
+    lines = [f"FLASER 3 1.0 2.0 3.0 {x} 0 0 {x} 0 0 {100 + i}.5 host {i}.0\n" for i, x in enumerate(told)]
+    log = open_log(written(tmp_path / "log", (HEADER + "".join(lines)).encode()))
+    steps = np.diff([scan.odometry[0] for scan in log.scans()])
+    expected = np.full(39, 0.1)
+    expected[[9, 10, 19]] = 0.0
+    expected[29] = 15.1
+    np.testing.assert_allclose(steps, expected, atol=1e-9)
+    (blemish,) = log.report.blemishes()
+    assert blemish == (
+        f"{log.path}:12: odometry jumps by 20000 m, farther than a robot drives between two scans: taken as no motion, "
+        "3 times"
+    )
+
+
+def test_odometry_in_millimetres_is_asked_about(tmp_path: Path) -> None:
+    lines = [f"FLASER 3 1.0 2.0 3.0 {90 * i} 0 0 {90 * i} 0 0 {100 + i}.5 host {i}.0\n" for i in range(40)]
+    log = open_log(written(tmp_path / "log", (HEADER + "".join(lines)).encode()))
+    assert {scan.odometry[0] for scan in log.scans()} == {0.0}
+    (blemish,) = log.report.blemishes()
+    assert blemish.endswith("39 times; is it in metres?")
+
+
+def test_times_that_are_none_are_left_out(tmp_path: Path) -> None:
+    nanoseconds = LOG.replace(" host", "000000000000 host", 1)
+    log = open_log(written(tmp_path / "log", nanoseconds.replace("100.5", "100000000000000", 1).encode()))
+    assert len(list(log.scans())) == 39
+    assert "is not a time in seconds" in log.report.blemishes()[1]
+
+
+def test_a_mark_of_the_byte_order_costs_no_line(tmp_path: Path) -> None:
+    content = LOG.removeprefix(HEADER).encode()
+    assert len(scans(written(tmp_path / "log", b"\xef\xbb\xbf" + content))) == 40
+
+
+def test_a_pipe_is_no_log(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(LogError, match="is a pipe or a device, not a file; save it first"):
+        open_log(tmp_path / "pipe")
+
+
+def test_what_damage_makes_of_a_compressed_log_is_called_damage(tmp_path: Path) -> None:
+    content = bytearray(bz2.compress(b"".join(b"%d nonsense %d\n" % (i, i * i) for i in range(40_000))))
+    content[len(content) // 20] ^= 4
+    with pytest.raises(LogError, match="compressed data is cut off or damaged"):
+        open_log(written(tmp_path / "log", bytes(content)))

@@ -253,7 +253,7 @@ def test_where_nothing_was_hit(tmp_path: Path, lines: list[str], max_range: floa
         (flaser(odometry=("nan", 0, 0)), "odometry (nan, 0, 0) is not a pose"),
         (flaser(odometry=(0, "1e300", 0)), "odometry (0, 1e+300, 0) is not a pose"),
         (flaser(odometry=(0, 0, "inf")), "odometry (0, 0, inf) is not a pose"),
-        (flaser(time="nan"), "time nan is not a time"),
+        (flaser(time="nan"), "time nan is not a time in seconds"),
     ],
 )
 def test_a_line_that_cannot_be_read_is_skipped_and_named(tmp_path: Path, line: str, reason: str) -> None:

@@ -306,6 +306,7 @@ def test_any_change_ends_in_scans_or_one_error(tmp_path: Path, data: st.DataObje
         assert all(np.isfinite(scan.time) and np.isfinite(scan.odometry).all() for scan in got)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
     def peak(count: int) -> int:
         blocks = (NEW.odometry((i, 0, 0), i) + NEW.scan([2.0] * 100, i) + STRANGER for i in range(1, count))
