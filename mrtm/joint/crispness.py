@@ -24,6 +24,7 @@ from scipy.special import entr
 from frontend import se2
 from frontend.local_map import Grid, LocalMap
 from frontend.records import FloatArray
+from mrtm.joint.fusion import drawable
 
 Maps = Sequence[tuple[gtsam.Pose2, LocalMap]]
 
@@ -57,6 +58,7 @@ def crispness(maps: Maps, resolution: float = 0.05) -> Crispness:
     if not corners:
         return Crispness(math.nan, math.nan, 0.0)
     box = np.concatenate(corners)
+    resolution = drawable(box, resolution)
     entropy, disagreement = opinions(maps, np.array([box.min(axis=0), box.max(axis=0)]), resolution)
     cells = int(np.isfinite(entropy).sum())
     if cells == 0:

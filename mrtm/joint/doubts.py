@@ -65,6 +65,13 @@ class Doubts:
         self._tried = 0  # edges that the graph had when a set last could not come in
         self._next = 0  # place among all edges of the next believed one to be checked
 
+    def forget(self, gone: Iterable[EdgeId]) -> None:
+        """What was found of edges that go, or change, holds no longer."""
+        for i in gone:
+            self._failed.pop(i, None)
+            for j in self._agreeing.pop(i, ()):
+                self._agreeing[j].discard(i)
+
     def settle(self, equations: Equations, new: Collection[EdgeId]) -> None:
         """Bring a graph that has changed to rest: let in, and put out, until nothing is due.
 
@@ -202,17 +209,30 @@ def _contradicted(equations: Equations, members: Sequence[EdgeId]) -> list[EdgeI
     went = [i for i in _strained(equations) if i not in members]
     may = outnumbers(len(members), len(went)) if went else True
     if may and went and (may := equations.may_go(went)):
-        equations.doubt([*members, *went])
+        out = _spare(equations, went, members)
+        equations.doubt(out)
         before = equations.cost()
-        equations.believe(members, kernel=False)
+        equations.believe([i for i in out if i not in went], kernel=False)
     if may and not _strained(equations) and equations.cost() - before <= _set_gate(len(members)) + SLIP:
         equations.put_under_kernel(members)
         return went
-    equations.doubt(members)
     again = [i for i in went if i in equations.doubted]
-    if again:
+    if again:  # first, as they may hold what the members do now
         equations.believe(again)
+    equations.doubt(members)
     return None
+
+
+def _spare(equations: Equations, went: Sequence[EdgeId], members: Sequence[EdgeId]) -> list[EdgeId]:
+    """Those that went, and with them all members but what then holds vertices: by itself that strains nothing."""
+    out = [*went, *members]
+    if equations.may_go(out):
+        return out
+    out = [*went]
+    for i in members:
+        if equations.may_go([*out, i]):
+            out.append(i)
+    return out
 
 
 def _strained(equations: Equations) -> list[EdgeId]:

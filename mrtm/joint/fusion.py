@@ -23,6 +23,9 @@ Local maps fit to about a cell. Where they differ by one, a wall of one is free 
 stays a wall if more than FREE_VOTE / (OCCUPIED_VOTE + FREE_VOTE), about a quarter, of the maps that see the cell say
 so. A person who stood still in one map, or a second wall of one map that slipped, is outvoted."""
 
+MOST_CELLS = 1e8
+"""Of a joint grid, half a kilometre square at 0.05 m; over more ground its cells are coarser."""
+
 UNKNOWN = 0.01
 """Log-odds up to here are what rounding leaves of nothing."""
 
@@ -43,8 +46,8 @@ def fuse(maps: Sequence[tuple[gtsam.Pose2, LocalMap]], resolution: float = 0.05,
         box: (2, 2) least and largest x, y of the part to draw, metres in the joint frame; the result just covers it.
 
     Returns:
-        A grid in the joint frame; its origin is a multiple of the resolution. Without a box of size (1, 1) if nothing
-        is known.
+        A grid in the joint frame; its origin is a multiple of the resolution, which is doubled as often as it takes for
+        MOST_CELLS to do. Without a box of size (1, 1) if nothing is known.
 
     Raises:
         ValueError: ``resolution`` is not positive or a pose is not finite.
@@ -63,6 +66,7 @@ def fuse(maps: Sequence[tuple[gtsam.Pose2, LocalMap]], resolution: float = 0.05,
     if box is None and not placed:
         return unknown
     extent = np.concatenate([_corners(pose, grid) for pose, grid in placed]) if box is None else box
+    resolution = drawable(extent, resolution)
     low = np.floor(extent.min(axis=0) / resolution + 1e-6)  # a border that is a multiple, give or take rounding
     width, height = (np.ceil(extent.max(axis=0) / resolution - 1e-6) - low).astype(int)
     origin = low * resolution
@@ -77,6 +81,14 @@ def fuse(maps: Sequence[tuple[gtsam.Pose2, LocalMap]], resolution: float = 0.05,
     np.clip(total, -LIMIT, LIMIT, out=total)
     fused = Grid(total, resolution, origin)
     return fused if box is not None else _crop(fused) or unknown
+
+
+def drawable(points: FloatArray, resolution: float) -> float:
+    """Metres a cell, doubled as often as it takes for a grid around ``points`` (n, 2) to have MOST_CELLS at most."""
+    spans = np.ptp(points, axis=0)
+    while float(np.prod(np.maximum(spans / resolution, 1.0))) > MOST_CELLS:
+        resolution *= 2.0
+    return resolution
 
 
 def _crop(grid: Grid) -> Grid | None:

@@ -26,6 +26,10 @@ from mrtm.joint.smoother import Smoother
 FloatArray = npt.NDArray[np.float64]
 
 
+UNSOLVABLE = RuntimeError, IndexError, np.linalg.LinAlgError
+"""What GTSAM and NumPy raise where numbers are beyond what double precision can solve."""
+
+
 class GraphError(ValueError):
     """A change or a question that the joint graph cannot accept; it is as it was before."""
 
@@ -229,7 +233,7 @@ class JointGraph:
         self._before = None
         try:
             yield
-        except (GraphError, RuntimeError) as error:
+        except Exception as error:
             self._keys, self._next_key, self._edges, self._doubted = keys, next_key, edges, doubted
             while len(keys) > vertices_before:
                 keys.popitem()
@@ -238,6 +242,8 @@ class JointGraph:
             if isinstance(error, GraphError):  # found before the solver was touched
                 raise
             self._begin_anew()
+            if not isinstance(error, UNSOLVABLE):
+                raise
             raise GraphError(f"the joint graph cannot be solved with this change: {error}") from error
 
     def _begin_anew(self) -> None:
@@ -269,6 +275,7 @@ class JointGraph:
         made: dict[VertexId, gtsam.Pose2] = {}
         self._place(added, made)
         out = removed | {edge.id for edge in replaced}
+        self._doubts.forget(out)
         believed = {i for i in out if i not in self._doubted}
         self._doubted = {i: chi2 for i, chi2 in self._doubted.items() if i not in out}
         judged = [*replaced, *added]
@@ -359,14 +366,11 @@ class JointGraph:
     def _needed(self) -> list[GraphEdge]:
         """Doubted edges, which are so no longer, without which vertices would be cut off."""
         needed: list[GraphEdge] = []
-        lost = cut_off(self._vertices_but_root(), self._believed())
-        for edge in [self._edges[i] for i in self._doubted]:
-            if not lost:
-                break
-            if (edge.tail in lost) != (edge.head in lost) and edge.estimate is not None:
-                del self._doubted[edge.id]
-                needed.append(edge)
-                lost = cut_off(self._vertices_but_root(), self._believed())
+        while lost := cut_off(self._vertices_but_root(), self._believed()):
+            doubted = (self._edges[i] for i in self._doubted)
+            edge = next(e for e in doubted if e.estimate is not None and (e.tail in lost) != (e.head in lost))
+            del self._doubted[edge.id]
+            needed.append(edge)
         return needed
 
     def _believed(self) -> Iterator[GraphEdge]:

@@ -14,6 +14,9 @@ from mrtm.joint.own_graph import own_graph, refusal
 
 MISPLACED = 4  # edges that sightings made between two robots, half of them doubted, for a component to be made anew
 
+TRIES = 4
+"""To merge a robot in: with all edges that sightings made, then by one at a time."""
+
 SLIPPED = 0.05
 """Of the pairs of robots: so few of them are misplaced because a robot's own map is wrong, and will be so anew."""
 
@@ -44,15 +47,20 @@ class JointMap:
     join them into components. A component's frame is that of the first of its robots' names, whoever makes the map:
     the same edges make the same map.
 
-    Attributes:
-        refused: edges that cannot be, and why. One is left out until it comes in a higher version.
     """
 
     def __init__(self) -> None:
-        self.refused: dict[EdgeId, str] = {}
+        self._refused: dict[str, dict[EdgeId, str]] = {}  # of each robot's own edges,
+        self._unfit: dict[EdgeId, tuple[GraphEdge, str]] = {}  # and of those added
         self._edges: dict[str, dict[EdgeId, Edge]] = {}  # the highest version of each robot's own
         self._own: dict[str, JointGraph] = {}
         self._component: dict[str, Component] = {}
+
+    @property
+    def refused(self) -> dict[EdgeId, str]:
+        """Edges that cannot be, and why; each is left out until it, or what it joins, comes in another version."""
+        own = {i: why for refused in self._refused.values() for i, why in refused.items()}
+        return own | {i: why for i, (_, why) in self._unfit.items()}
 
     @property
     def robots(self) -> Mapping[str, JointGraph]:
@@ -76,9 +84,9 @@ class JointMap:
     def learn(self, edges: Iterable[Edge], robots: Iterable[str] = ()) -> None:
         """Take new edges, and new versions of known ones, that robots made within their own maps (M5, M7, M8).
 
-        Components of several robots have them from the next ``join`` on. Any order will do: an edge that nothing
-        connects yet waits for those that do, and a version that comes after a higher one does nothing. An edge that
-        cannot be is ``refused``, and nothing else suffers.
+        Components that anything was added to have them from the next ``join`` on. Any order will do: an edge that
+        nothing connects yet waits for those that do, and a version that comes after a higher one does nothing. An edge
+        that cannot be is ``refused``, and nothing else suffers.
 
         Args:
             robots: names of robots heard of; one with a single vertex has no edge.
@@ -87,30 +95,31 @@ class JointMap:
         for edge in edges:
             known = self._edges.setdefault(edge.id.robot, {})
             before = known.get(edge.id)
-            if before is not None and edge.version <= before.version:
-                continue
-            if before is not None and (edge.tail, edge.head) != (before.tail, before.head):
-                self.refused[edge.id] = refusal(edge, f"its ends were {before.tail} and {before.head}")
+            if before is not None and (edge.version < before.version or edge is before):
                 continue
             known[edge.id] = edge
             changed.add(edge.id.robot)
+        self._unfit = {i: found for i, found in self._unfit.items() if not _ends(found[0]) & changed}
         for robot in sorted(changed):
             alone = robot not in self._own or self._component[robot].graph is self._own[robot]
             own = tuple(edge for _, edge in sorted(self._edges.get(robot, {}).items()))
-            self._own[robot], refused = own_graph(robot, own)
-            self.refused |= refused
+            self._own[robot], self._refused[robot] = own_graph(robot, own)
             if alone:
-                self._apart([robot])
+                self._component[robot] = self._made((robot,), {})
 
     def join(self, added: Iterable[GraphEdge]) -> None:
         """Let ``added`` be all the edges beside the robots' own (M11, M13): robots come into one frame, or fall apart.
 
         What was learned since comes in with them. Edges that fix a pose join; a range and bearing between robots that
-        nothing else joins is left out. Where the equations cannot be solved with them, the robots stay apart and one of
-        the edges is ``refused``.
+        nothing else joins is left out. An edge with which the equations cannot be solved is ``refused``; so is a robot
+        with which they cannot be by the edges tried: it stays apart, and the others come together.
         """
         edges = {edge.id: edge for edge in sorted(added, key=lambda e: e.id)}
-        for robots in self.connected(edges.values()):
+        self._unfit = {i: found for i, found in self._unfit.items() if edges.get(i) is found[0]}
+        edges = {i: edge for i, edge in edges.items() if i not in self._unfit}
+        groups = self.connected(edges.values())
+        while groups:
+            robots = groups.pop(0)
             mine = {i: e for i, e in edges.items() if _ends(e) <= set(robots)}
             component = self._component[robots[0]]
             if component.robots == robots and component.added.keys() and mine:
@@ -120,26 +129,15 @@ class JointMap:
                         continue
                 except GraphError:
                     pass  # perhaps on the way there only
-            try:
-                component = self._grown(component, robots, mine) or self._made(robots, mine)
-            except GraphError as error:
-                self._refuse(next(iter(mine.values())), error)
-                self._apart(robots)
-            else:
-                component.misplaced = len(_misplaced(component))
-                self._component.update(dict.fromkeys(robots, component))
+            component = self._grown(component, robots, mine) or self._made(robots, mine)
+            component.misplaced = len(_misplaced(component))
+            self._component.update(dict.fromkeys(component.robots, component))
+            if left := {*robots} - {*component.robots}:
+                groups += self.connected((e for e in mine.values() if _ends(e) <= left), left)
 
-    def _refuse(self, edge: GraphEdge, error: GraphError) -> None:
-        self.refused[edge.id] = refusal(edge, error)
-
-    def _apart(self, robots: Iterable[str]) -> None:
-        """Let every robot have its own map."""
-        for robot in robots:
-            self._component[robot] = Component((robot,), self._own[robot], {}, {robot: self._own[robot]})
-
-    def connected(self, edges: Iterable[GraphEdge]) -> list[tuple[str, ...]]:
-        """The robots that edges would bring together, names ascending."""
-        group = {robot: {robot} for robot in self._own}
+    def connected(self, edges: Iterable[GraphEdge], robots: Iterable[str] | None = None) -> list[tuple[str, ...]]:
+        """The robots, all or some, that edges between them would bring together, names ascending."""
+        group = {robot: {robot} for robot in (self._own if robots is None else robots)}
         for edge in edges:
             a, b = group[edge.tail.robot], group[edge.head.robot]
             if edge.estimate is not None and a is not b:
@@ -157,7 +155,8 @@ class JointMap:
             out.add(worst)
             pairs = [pair for pair in pairs if worst not in pair]
         graph.update(remove_vertices=[vertex for vertex in graph.vertices() if vertex.robot in out])
-        self._merge(graph, {*robots} - out, robots, component.added)
+        if self._merge(graph, {*robots} - out, robots, component.added) < {*robots}:
+            raise GraphError(f"{', '.join(sorted(out))} cannot be merged in anew")
         return _in_place(component)
 
     def _grown(self, component: Component, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> Component | None:
@@ -168,19 +167,24 @@ class JointMap:
             return None
         try:
             self._exchange(component, within)
-            self._merge(component.graph, inside, robots, added)
         except GraphError:
             return None
-        return Component(robots, component.graph, added, {robot: self._own[robot] for robot in robots})
+        return self._of(component.graph, self._merge(component.graph, inside, robots, added), added)
 
     def _made(self, robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]) -> Component:
         """The robots' own graphs made one: the first one's, then the others in the order in which they are reached."""
-        root, graph = robots[0], self._own[robots[0]]
+        root, graph, reached = robots[0], self._own[robots[0]], {robots[0]}
         if added:
             graph = JointGraph(VertexId(root, 0))
             graph.update(add=self._own[root].edges())
-            self._merge(graph, {root}, robots, added)
-        return Component(robots, graph, added, {robot: self._own[robot] for robot in robots})
+            reached = self._merge(graph, reached, robots, added)
+        return self._of(graph, reached, added)
+
+    def _of(self, graph: JointGraph, reached: set[str], added: dict[EdgeId, GraphEdge]) -> Component:
+        """The component of the robots reached."""
+        robots = sorted(reached)
+        within = {i: e for i, e in added.items() if _ends(e) <= reached and i not in self._unfit}
+        return Component(tuple(robots), graph, within, {robot: self._own[robot] for robot in robots})
 
     def _exchange(self, component: Component, added: dict[EdgeId, GraphEdge]) -> None:
         """Bring a component whose robots stay the same up to date: its robots' own edges, and other added ones."""
@@ -189,9 +193,11 @@ class JointMap:
         was, now = ({edge.id: edge for graph in some for edge in graph.edges()} for some in graphs)
         vertices, left = ({vertex for graph in some for vertex in graph.vertices()} for some in graphs)
         was, now = was | component.added, now | added
-        add = [edge for i, edge in now.items() if i not in was]
-        replace = [edge for i, edge in now.items() if i in was and edge.version > was[i].version]
-        gone = [i for i in was if i not in now]
+        # Two records may tell the same version, or versions of other ends: the later is another edge.
+        other = {i for i, edge in now.items() if i in was and edge is not was[i] and not _follows(edge, was[i])}
+        add = [edge for i, edge in now.items() if i not in was or i in other]
+        replace = [edge for i, edge in now.items() if i in was and edge is not was[i] and i not in other]
+        gone = [i for i in was if i not in now or i in other]
         if add or replace or gone:
             component.graph.update(add=add, replace=replace, remove=gone, remove_vertices=vertices - left)
         component.added = added
@@ -199,21 +205,43 @@ class JointMap:
 
     def _merge(
         self, graph: JointGraph, reached: set[str], robots: tuple[str, ...], added: dict[EdgeId, GraphEdge]
-    ) -> None:
-        """Take the other robots' own graphs into that of those ``reached``.
+    ) -> set[str]:
+        """Take the other robots' own graphs into that of those ``reached``, as far as it can be; who then is.
 
         What sightings made comes first; alignments refine where it has put the robots.
         """
         fused = {i: e for i, e in added.items() if e.kind in FUSED}
+        failed = Counter[str]()
         while len(reached) < len(robots):
-            edges = (*fused.values(), *added.values())
-            bridge = next(e for e in edges if e.estimate and _ends(e) & reached and _ends(e) - reached)
+            without = {robot for robot, times in failed.items() if times >= TRIES}
+            edges = (e for e in (*fused.values(), *added.values()) if e.id not in self._unfit)
+            bridges = (e for e in edges if e.estimate and _ends(e) & reached and _ends(e) - reached - without)
+            if (bridge := next(bridges, None)) is None:
+                break
             both = reached | _ends(bridge)
+            (newcomer,) = both - reached
             rest = [e for e in fused.values() if e is not bridge and _ends(e) <= both and not _ends(e) <= reached]
-            graph.merge(self._own[(both - reached).pop()], bridge, rest, more=True)
-            reached = both
-        known = {edge.id for edge in graph.edges()}
-        graph.update(add=[e for i, e in added.items() if i not in known])
+            try:
+                graph.merge(self._own[newcomer], bridge, rest if newcomer not in failed else (), more=True)
+                reached = both
+            except GraphError as error:
+                if newcomer in failed:
+                    self._unfit[bridge.id] = bridge, refusal(bridge, error)
+                failed[newcomer] += 1
+        known = {edge.id for edge in graph.edges()} | self._unfit.keys()
+        self._add(graph, [e for i, e in added.items() if i not in known and _ends(e) <= reached])
+        return reached
+
+    def _add(self, graph: JointGraph, edges: list[GraphEdge]) -> None:
+        """Let a graph have edges, all but those that cannot be."""
+        try:
+            graph.update(add=edges)
+        except GraphError:  # one by one: which is it?
+            for edge in edges:
+                try:
+                    graph.update(add=[edge])
+                except GraphError as error:
+                    self._unfit[edge.id] = edge, refusal(edge, error)
 
 
 def _misplaced(component: Component) -> list[frozenset[str]]:
@@ -232,6 +260,11 @@ def _misplaced(component: Component) -> list[frozenset[str]]:
 def _in_place(component: Component) -> bool:
     """Whether hardly more robots are misplaced than when the component was made."""
     return len(_misplaced(component)) <= GROWN * component.misplaced
+
+
+def _follows(edge: GraphEdge, old: GraphEdge) -> bool:
+    """Whether an edge is a newer version of another."""
+    return edge.version > old.version and (edge.tail, edge.head) == (old.tail, old.head)
 
 
 def _ends(edge: GraphEdge) -> set[str]:

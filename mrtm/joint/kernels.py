@@ -42,6 +42,8 @@ class Kernels:
                 before = self._weights.get(edge_id, 1.0) if edge_id in exchanged else None
                 self._weights[edge_id] = weight(factor, values(factor.keys())) if before is None else before
                 factor = weighed(factor, self._weights[edge_id])
+            else:
+                self._weights.pop(edge_id, None)
             found[edge_id] = factor
         return found
 

@@ -27,19 +27,19 @@ def own_graph(robot: str, edges: tuple[Edge, ...]) -> OwnGraph:
     """Solve a robot's own edges, in the order of their ids, from scratch: a function of these and nothing else."""
     root = VertexId(robot, 0)
     refused = {e.id: refusal(e, "a robot's own edges join its own vertices") for e in edges if not _is_own(e, robot)}
-    reached = list(_reached(root, [e for e in edges if e.id not in refused]))
+    reached = list(_reached([root], [e for e in edges if e.id not in refused]))
     graph = JointGraph(root)
     try:
         graph.update(add=reached)
     except GraphError:  # one by one: which is it?
-        known = {root}
-        for edge in reached:
+        left = reached
+        while left:
+            edge = left.pop(0)
             try:
-                if edge.tail in known or edge.head in known:
-                    graph.update(add=[edge])
-                    known |= {edge.tail, edge.head}
+                graph.update(add=[edge])
             except GraphError as error:
                 refused[edge.id] = refusal(edge, error)
+                left = list(_reached(graph.vertices(), left))  # perhaps by another way
     graph.optimize_fully()
     return OwnGraph(graph, refused)
 
@@ -53,9 +53,9 @@ def _is_own(edge: Edge, robot: str) -> bool:
     return edge.tail.robot == edge.head.robot == robot
 
 
-def _reached(root: VertexId, edges: Iterable[Edge]) -> Iterator[Edge]:
-    """The edges that are connected to the root, each after one that connects it."""
-    known, left = {root}, list(edges)
+def _reached(vertices: Iterable[VertexId], edges: Iterable[Edge]) -> Iterator[Edge]:
+    """The edges that are connected to some vertices, each after one that connects it."""
+    known, left = {*vertices}, list(edges)
     while left:
         waiting = []
         for edge in left:

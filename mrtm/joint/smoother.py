@@ -8,7 +8,8 @@ is such a one). From then on QR, which solves those too and takes up to twice as
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, TypeVar
 
 import gtsam
 import numpy as np
@@ -19,6 +20,7 @@ from mrtm.joint.kernels import Kernels
 from mrtm.joint.relinearization import TURN, portion
 
 FloatArray = npt.NDArray[np.float64]
+T = TypeVar("T")
 
 
 class _Tolerance(NamedTuple):
@@ -169,7 +171,7 @@ class Smoother:
 
     def marginal(self, key: int) -> FloatArray:
         """(3, 3) covariance of the pose of ``key``, in its own frame."""
-        return _symmetric(self._isam.marginalCovariance(key))
+        return self._solve(lambda: _symmetric(self._isam.marginalCovariance(key)))
 
     def relative_covariances(self, pairs: Sequence[tuple[int, int]]) -> list[FloatArray]:
         """(3, 3) covariance of reference_T_key, in the frame of ``key``, for every such pair, which may be the same.
@@ -179,18 +181,20 @@ class Smoother:
         it comes from one elimination of the graph for all.
         """
         if len(pairs) == 1 and pairs[0][0] != pairs[0][1]:
-            a, b = pairs[0]
-            joint, carry = self._isam.jointMarginalCovariance([a, b]), self._carry(a, b)
-            cross = carry @ joint.at(a, b)
-            return [_symmetric(carry @ joint.at(a, a) @ carry.T + cross + cross.T + joint.at(b, b))]
+            return [self._solve(partial(self._relative_covariance, *pairs[0]))]
         together = (pairs[first : first + TOGETHER] for first in range(0, len(pairs), TOGETHER))
-        return [root @ root.T for some in together for root in self._roots(some)]
+        return [root @ root.T for some in together for root in self._solve(partial(self._roots, some))]
+
+    def _relative_covariance(self, a: int, b: int) -> FloatArray:
+        joint, carry = self._isam.jointMarginalCovariance([a, b]), self._carry(a, b)
+        cross = carry @ joint.at(a, b)
+        return _symmetric(carry @ joint.at(a, a) @ carry.T + cross + cross.T + joint.at(b, b))
 
     def joint_covariance(self, pairs: Sequence[tuple[int, int]]) -> FloatArray:
         """(3 n, 3 n) ``relative_covariances`` of n pairs, TOGETHER or fewer, with what lies between them."""
         if len(pairs) == 1:
             return self.relative_covariances(pairs)[0]
-        roots = self._roots(pairs).reshape(3 * len(pairs), -1)
+        roots = self._solve(partial(self._roots, pairs)).reshape(3 * len(pairs), -1)
         return np.asarray(roots @ roots.T)
 
     def _roots(self, pairs: Sequence[tuple[int, int]]) -> FloatArray:
@@ -229,10 +233,10 @@ class Smoother:
         self._kernels = Kernels()
         self._insert(dict(factors), rest, (), 0)
 
-    def _solve(self, step: Callable[[], None]) -> None:
+    def _solve(self, step: Callable[[], T]) -> T:
         """Do a ``step``; where Cholesky gives up in it, all is begun anew with QR and it is done again."""
         try:
-            step()
+            return step()
         except RuntimeError:
             self._fall_back()
             values = self.start()
@@ -240,7 +244,7 @@ class Smoother:
             for key in {*values.keys()} - held:
                 values.erase(key)
             self._build(self._factors, values)
-            step()
+            return step()
 
     def _fall_back(self) -> None:
         """From Cholesky to QR; if that is what has failed, on with its error."""

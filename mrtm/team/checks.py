@@ -11,9 +11,13 @@ from factors import FactorError, VertexId, check_pose
 from mrtm.errors import MrtmError
 
 LONGEST_NAME = 64
+"""Bytes in UTF-8, as file systems count."""
+NAME = f"a name of at most {LONGEST_NAME} letters (bytes in UTF-8), digits or - _ ."
 LARGEST_NUMBER = 2**31 - 1
 FARTHEST = 1e6
 """Metres; no coordinate of a building lies beyond."""
+SUREST, VAGUEST = 1e-6, 1e4
+"""Standard deviations, metres or radians: their squares are fit for variances."""
 LATEST = 1e12
 """Seconds, either way."""
 LARGEST_GRID = 4000
@@ -38,16 +42,20 @@ def check(good: bool, what: str, field: str, value: Any, must: str) -> None:
         raise RecordError(f"{what}: {field} is {text}; must be {must}")
 
 
+def is_name(name: Any) -> bool:
+    """Whether it does as a robot's name: as a file's on every system."""
+    return isinstance(name, str) and name != "" and fit_name(name) == name
+
+
+def fit_name(name: str) -> str:
+    """The name as a file's: what is fit for none is replaced by _, and what is too long is cut off."""
+    name = "".join("_" if letter in '/\\:*?"<>|' or not letter.isprintable() else letter for letter in name)
+    return name.strip(" .").encode()[:LONGEST_NAME].decode(errors="ignore").rstrip(" .")
+
+
 def check_name(name: Any, what: str, field: str) -> None:
-    """Refuse a robot's name that is not fit for a file name on every system."""
-    fit = (
-        isinstance(name, str)
-        and 0 < len(name) <= LONGEST_NAME
-        and name.isprintable()
-        and not set(name) & set('/\\:*?"<>|')
-        and name == name.strip(" .")
-    )
-    check(fit, what, field, name, f"a name of at most {LONGEST_NAME} letters, digits or - _ .")
+    """Refuse what is no robot's name."""
+    check(is_name(name), what, field, name, NAME)
 
 
 def check_frame(what: str, shape: tuple[int, ...], resolution: float, origin: npt.ArrayLike) -> None:

@@ -21,6 +21,8 @@ from mrtm.team.checks import (
     LATEST,
     MOST_PLACES,
     MOST_POINTS,
+    SUREST,
+    VAGUEST,
     RecordError,
     check,
     check_array,
@@ -171,7 +173,7 @@ class AnchorRecord:
 
     Attributes:
         version: 0 is provisional; from 1 on the map has been closed and the pose refined.
-        vertex: in whose frame; versions may differ in it.
+        vertex: of the robot, in whose frame; versions may differ in it.
         pose: vertex_T_robot with its covariance in the frame of the robot.
     """
 
@@ -187,6 +189,7 @@ class AnchorRecord:
         _check_header(self)
         what = _what(self)
         check_vertex(self.vertex, what, "vertex")
+        check(self.vertex.robot == self.robot, what, "vertex", str(self.vertex), f"one of {self.robot}")
         pose, covariance = self.pose
         check_position(pose, what, "pose")
         try:
@@ -205,7 +208,7 @@ class SightingRecord:
     """A robot saw another; where both were is in their anchors.
 
     Attributes:
-        version: 0: what was seen does not change.
+        version: 0, as what was seen does not change.
         observer_anchor, observed_anchor: (robot, number) of an anchor of the observer, of the observed.
     """
 
@@ -228,7 +231,11 @@ class SightingRecord:
             owner, number = getattr(self, f"{name}_anchor")
             check(owner == robot, what, f"{name}_anchor", owner, f"one of {robot}")
             check_whole(number, what, f"{name}_anchor")
-        check(self.measurement.range <= FARTHEST, what, "range", self.measurement.range, f"at most {FARTHEST:g} m")
+        m = self.measurement
+        check(m.range <= FARTHEST, what, "range", m.range, f"at most {FARTHEST:g} m")
+        for name, sigma in (("range", m.sigma_range), ("bearing", m.sigma_bearing), ("heading", m.sigma_heading)):
+            good = sigma is None or SUREST <= sigma <= VAGUEST
+            check(good, what, f"sigma_{name}", sigma, f"from {SUREST:g} to {VAGUEST:g}")
 
     @property
     def key(self) -> Key:

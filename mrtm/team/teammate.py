@@ -14,7 +14,7 @@ from mrtm.joint.sightings.consistency import Judgement, Verdict, judge
 from mrtm.joint.sightings.hypotheses import HypothesisId
 from mrtm.team.evidence import evidence
 from mrtm.team.meeting import anchored, bridges, fusing_edges, sightings
-from mrtm.team.records import EdgeRecord, Key, Kind, SightingRecord, VertexRecord
+from mrtm.team.records import EdgeRecord, Key, Kind, Record, SightingRecord, VertexRecord
 from mrtm.team.store import R, Store
 from mrtm.team.surfaces import Surfaces
 from mrtm.timing import Stages
@@ -77,7 +77,7 @@ class Teammate:
         self._maps = Surfaces(self.store)
         self._found: dict[EdgeId, Edge | SightingEdge] = {}  # what the sightings last came to,
         self._fusing: dict[EdgeId, Edge | SightingEdge] = {}  # and these as versions
-        self._told: dict[Key, int] = {}  # version of each record that the joint map knows
+        self._told: dict[Key, Record] = {}  # what the joint map knows
         self._held = b""  # the hash of what was known when sightings were last judged
         self._thought = 0, 0  # how many records, and sightings, were known at the last ``think``
 
@@ -110,10 +110,11 @@ class Teammate:
 
     def _hear(self) -> None:
         """Bring the robots' own maps up to date with the records."""
-        robots = {record.id.robot for record in self._news(VertexRecord)}
-        edges = [record.edge for record in self._news(EdgeRecord)]
+        vertices, edges = self._news(VertexRecord), self._news(EdgeRecord)
         with self._stages("joint map"):
-            self.joint.learn(edges, robots)
+            self.joint.learn((record.edge for record in edges), {record.id.robot for record in vertices})
+        self._told |= {record.key: record for record in vertices}
+        self._told |= {record.key: record for record in edges}
 
     def _size(self) -> tuple[int, int]:
         return len(self.store), self.store.count(SightingRecord)
@@ -157,9 +158,7 @@ class Teammate:
 
     def _news(self, kind: type[R]) -> list[R]:
         """Records of a type that the joint map does not know yet."""
-        news = [r for r in self.store.of(kind) if self._told.get(r.key, -1) < r.version]
-        self._told.update({r.key: r.version for r in news})
-        return news
+        return [record for record in self.store.of(kind) if self._told.get(record.key) is not record]
 
     def _fuse(self) -> None:
         """M11: judge all sightings anew, and let the accepted ones be the fusing edges."""

@@ -105,6 +105,33 @@ def test_an_alignment_is_dropped_when_the_map_turns_out_another() -> None:
     assert edge.version == 1  # the number of the one that was dropped is not used again
 
 
+def test_whoever_holds_an_alignment_is_told_when_a_map_has_become_too_small_for_it() -> None:
+    joint, one = graph(), Aligner()
+    one.look(joint, maps(), 12)
+    assert one.edges()
+    assert one.look(joint, {BLUE: surface("blue"), RED: seen(ROOM, A, -1.0, 1.2, 5)}, 12)
+    assert one.edges() == []
+    assert one.attempts[PAIR].refusal == "they hardly overlap"
+
+
+def test_pairs_that_hardly_overlap_come_in_the_order_of_their_names() -> None:
+    """What is looked at next follows from it."""
+    row = [VertexId("red", number) for number in range(8)]
+    joint = JointGraph(row[0])
+    joint.update(
+        add=[
+            Edge(EdgeId("red", i), 0, EdgeKind.INTER_VERTEX, row[i], row[i + 1], gtsam.Pose2(11.0, 0.0, 0.0), SURE)
+            for i in range(7)
+        ]
+    )
+    known = {v: seen(OTHER, np.array([6.0, 4.0, 0.0]), -1.0, 13.0, v.number) for v in row}
+    one = Aligner()
+    one.look(joint, known, 12)
+    apart = [pair for pair, attempt in one.attempts.items() if attempt.refusal == "they hardly overlap"]
+    assert len(apart) > 3
+    assert apart == sorted(apart)
+
+
 def test_a_refused_pair_is_tried_again_only_when_the_guess_is_another(tries: list[None]) -> None:
     one = Aligner()
     assert one.look(graph(), maps("other"), 12)

@@ -69,12 +69,12 @@ def test_places_that_are_cut_off_are_refused() -> None:
 
 
 def test_the_vertex_of_another_robot_keeps_its_name() -> None:
-    record = record_of(Kind.ANCHOR)
-    assert isinstance(record, AnchorRecord)
-    other = AnchorRecord("red", 1, 0, 1.0, VertexId("grün", 9), record.pose)
-    again = unpack(pack(other))
-    assert isinstance(again, AnchorRecord)
-    assert again.vertex == VertexId("grün", 9)
+    """To be refused by name where the robot's own map is made."""
+    record = record_of(Kind.EDGE)
+    assert isinstance(record, EdgeRecord)
+    again = unpack(pack(EdgeRecord(replace(record.edge, tail=VertexId("grün", 9)), 1.0)))
+    assert isinstance(again, EdgeRecord)
+    assert again.edge.tail == VertexId("grün", 9)
 
 
 def test_the_same_record_has_the_same_bytes() -> None:

@@ -1,6 +1,7 @@
 """Which edges a graph believes: false ones are without effect, and what was believed wrongly is taken back."""
 
 import json
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -190,3 +191,24 @@ def test_a_clique_agrees_all_with_all() -> None:
     assert len(found) == 3
     assert all(b in agreeing[a] for a in found for b in found if a != b)
     assert clique(ids[2], agreeing, set(ids) - {ids[0]}) == [ids[2], ids[1]]
+
+
+def test_what_a_doubted_loop_agreed_with_does_not_hold_its_next_version_back() -> None:
+    """At the end of a visit every loop gets one. This one's first agreed with three false ones."""
+    ring = Ring(3)
+    ring.graph.update(add=closing(ring, 100, 2))
+    slip = ring.truth[30].compose(gtsam.Pose2(0.25, 0.0, 0.0)).compose(ring.truth[30].inverse())
+    far = ring.truth[30].compose(gtsam.Pose2(6.0, 2.0, 0.4)).compose(ring.truth[30].inverse())
+    true = [ring.edge(300 + n, 30, 31, moved=slip) for n in range(4)]
+    false = [ring.edge(250 + n, 30, 31, moved=far) for n in range(3)]
+    first = ring.edge(303, 30, 31, moved=far)
+    for edge in (*true[:3], *false, first):
+        ring.graph.update(add=[edge])
+    on = [
+        Edge(EdgeId("red", 500 + n), 0, EdgeKind.INTER_VERTEX, red(COUNT - 1 + n), red(COUNT + n), gtsam.Pose2(), STEP)
+        for n in range(4)
+    ]
+    ring.graph.update(add=on)
+    assert {edge.id for edge in (*true[:3], *false, first)} <= ring.graph.doubted()
+    ring.graph.update(replace=[replace(true[3], version=1)])
+    assert not ring.graph.doubted() & {edge.id for edge in true}

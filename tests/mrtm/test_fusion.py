@@ -8,6 +8,7 @@ import numpy.typing as npt
 import pytest
 
 from frontend.local_map import Grid, LocalMap
+from mrtm.joint import fusion
 from mrtm.joint.fusion import FREE_VOTE, LIMIT, OCCUPIED_VOTE, fuse
 
 Log = npt.NDArray[np.float32]
@@ -128,3 +129,12 @@ def test_bad_input_is_refused() -> None:
         fuse(maps)
     with pytest.raises(ValueError, match="resolution"):
         fuse([], 0.0)
+
+
+def test_over_much_ground_cells_are_coarser(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fusion, "MOST_CELLS", 1e4)
+    one = local_map(np.ones((20, 20), np.float32))
+    grid = fuse([(gtsam.Pose2(), one), (gtsam.Pose2(30.0, 20.0, 0.0), one)])
+    assert grid.resolution == 0.4
+    assert grid.log_odds.size <= 1e4
+    assert grid.resolution * grid.log_odds.shape[1] > 30.0

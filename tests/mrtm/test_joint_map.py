@@ -1,6 +1,8 @@
 """What a joint map makes of edges: in any order, late, twice, and of edges that cannot be."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -9,6 +11,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from factors import Edge, EdgeId, EdgeKind, GraphEdge, VertexId
+from mrtm.joint.graph import GraphError, JointGraph
 from mrtm.joint.joint_map import JointMap
 from tests.mrtm.sighting_world import STEP, TeamWorld
 from tests.mrtm.team_world import second_version
@@ -127,7 +130,6 @@ def test_a_new_version_reaches_the_joint_graph() -> None:
 
 
 BAD = {
-    "of other ends than before": own_edge("r1", 3, 0, 4, 7),
     "tail of another robot": Edge(
         EdgeId("r1", 50), 0, EdgeKind.LOOP, VertexId("r0", 1), VertexId("r1", 2), gtsam.Pose2(1, 0, 0), STEP
     ),
@@ -164,15 +166,100 @@ def test_an_edge_that_cannot_be_is_refused_and_named_and_nothing_else_suffers(
 
 def test_after_a_refused_version_a_higher_good_one_counts() -> None:
     joint = told(FIRST, JOINS)
-    bad = BAD["of other ends than before"]
+    bad = BAD["tail of another robot"]
     joint.learn([bad])
     joint.learn([bad])
-    good = next(e for e in FIRST if e.id == bad.id)
-    better = Edge(good.id, 9, good.kind, good.tail, good.head, good.measurement, 0.1 * good.covariance)
-    joint.learn([better])
+    assert list(joint.refused) == [bad.id]
+    joint.learn([own_edge("r1", 50, 1, 2, 9)])
+    assert joint.refused == {}
     joint.join(JOINS)
     (component,) = joint.components()
     assert {e.id: e.version for e in component.graph.edges()}[bad.id] == 9
+
+
+@pytest.mark.parametrize("first", [0, 1])
+@pytest.mark.parametrize("version", [0, 7])
+def test_of_what_is_told_of_one_edge_the_last_of_the_highest_version_counts(first: int, version: int) -> None:
+    """Also where its ends are others. Which of two records of one version is told last the store decides."""
+    ways = [own_edge("r1", 60, 3, 4), own_edge("r1", 60, 0, 4, version)]
+    joint = told(FIRST, JOINS)
+    for n in (first, 1 - first):
+        joint.learn([ways[n]])
+        joint.join(JOINS)
+    counts = ways[1] if version else ways[1 - first]
+    (component,) = joint.components()
+    for graph in (component.graph, joint.robots["r1"]):
+        (edge,) = [e for e in graph.edges() if e.id == counts.id]
+        assert (edge.version, edge.tail, edge.head) == (counts.version, counts.tail, counts.head)
+
+
+@pytest.mark.parametrize("known", [["r0", "r1", "r2"], ["r0"]])
+def test_a_robot_that_cannot_be_merged_stays_apart_and_the_others_come_together(
+    monkeypatch: pytest.MonkeyPatch, known: list[str]
+) -> None:
+    plain = JointGraph.merge
+
+    def give_up(graph: JointGraph, other: JointGraph, *rest: Any, **how: Any) -> None:
+        if other.root.robot == "r0" or graph.root.robot == "r0":
+            raise GraphError("the joint graph cannot be solved with this change")
+        plain(graph, other, *rest, **how)
+
+    joint = told([e for e in EDGES if e.id.robot in known])
+    with monkeypatch.context() as patch:
+        patch.setattr(JointGraph, "merge", give_up)
+        joint.learn(EDGES, WORLD.names)
+        for _ in range(2):
+            joint.join(JOINS)
+            assert [c.robots for c in joint.components()] == [("r0",), ("r1", "r2")]
+        assert joint.refused.keys() == {JOINS[0].id, JOINS[2].id}
+    joint.join(JOINS)
+    assert joint.refused  # they are left out
+    joint.learn([second_version(second_version(e)) for e in FIRST if e.id.robot == "r0"])
+    joint.join(JOINS)
+    assert joint.refused == {}
+    assert [c.robots for c in joint.components()] == [("r0", "r1", "r2")]
+
+
+def test_an_added_edge_that_cannot_be_is_left_out_until_it_comes_in_another_version(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plain, odd = JointGraph._place, between(VertexId("r0", 2), VertexId("r2", 3))
+
+    def give_up(graph: JointGraph, added: list[Any], made: dict[VertexId, gtsam.Pose2]) -> None:
+        if odd in added:
+            raise GraphError("the joint graph cannot be solved with this change")
+        plain(graph, added, made)
+
+    monkeypatch.setattr(JointGraph, "_place", give_up)
+    joint = told(EDGES, JOINS)
+    for added in ([*JOINS, odd], [*JOINS[1:], odd], [*JOINS, odd]):
+        joint.join(added)
+        assert joint.refused.keys() == {odd.id}
+        assert difference(joint, told(EDGES, [e for e in added if e is not odd])) < 2e-4
+    again = between(VertexId("r0", 2), VertexId("r2", 3), version=1)
+    joint.join([*JOINS, again])
+    assert joint.refused == {}
+    (component,) = joint.components()
+    assert again in component.graph.edges()
+
+
+@pytest.mark.parametrize("true", [4, 7])
+def test_a_false_edge_that_alone_joined_two_robots_gives_way_and_they_stay_together(true: int) -> None:
+    own = [replace(own_edge(robot, n, n, n + 1), kind=EdgeKind.INTER_VERTEX) for robot in "ab" for n in range(8)]
+
+    def across(number: int, off: float) -> Edge:
+        ends = VertexId("a", number), VertexId("b", number)
+        return Edge(EdgeId(f"ab{number}", 0), 0, EdgeKind.FUSING, *ends, gtsam.Pose2(off, 3.0 + off, 0.0), STEP)
+
+    false, rest = across(0, 4.0), [across(n, 0.0) for n in range(1, true + 1)]
+    for steps in ([[false, *rest]], [[false, *rest[:n]] for n in range(true + 1)]):
+        joint = JointMap()
+        joint.learn(own)
+        for added in steps:
+            joint.join(added)
+            assert [c.robots for c in joint.components()] == [("a", "b")]
+        assert joint.refused == {}
+        assert joint.components()[0].graph.doubted() == {false.id}
 
 
 def test_a_change_of_added_edges_is_the_map_made_anew() -> None:
@@ -223,3 +310,19 @@ def test_the_map_is_near_the_truth(whole: JointMap) -> None:
     true = {v: WORLD.truth[VertexId("r0", 0)].between(pose) for v, pose in WORLD.truth.items()}
     errors = [np.hypot(*(pose.translation() - true[v].translation())) for v, pose in whole.seen_from("r0").items()]
     assert max(errors) < 1.0
+
+
+def test_what_an_edge_that_cannot_be_would_have_connected_waits_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    bad, rest = own_edge("red", 1, 0, 1), [own_edge("red", 2, 1, 2), own_edge("red", 3, 0, 2)]
+    plain = JointGraph._place
+
+    def give_up(graph: JointGraph, added: list[Any], made: dict[VertexId, gtsam.Pose2]) -> None:
+        if bad in added:
+            raise GraphError("the joint graph cannot be solved with this change")
+        plain(graph, added, made)
+
+    monkeypatch.setattr(JointGraph, "_place", give_up)
+    joint = JointMap()
+    joint.learn([bad, *rest])
+    assert joint.refused.keys() == {bad.id}
+    assert {edge.id for edge in joint.robots["red"].edges()} == {edge.id for edge in rest}

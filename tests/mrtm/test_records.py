@@ -96,12 +96,16 @@ BAD: list[tuple[Callable[..., None], dict[str, Any], str]] = [
     (anchor, {"pose": UncertainPose(gtsam.Pose2(), -COVARIANCE)}, "covariance"),
     (anchor, {"pose": UncertainPose(gtsam.Pose2(), COVARIANCE[:2])}, "covariance"),
     (anchor, {"vertex": VertexId("red", -4)}, "vertex"),
+    (anchor, {"vertex": VertexId("blue", 2)}, "vertex"),
     (sighting, {"observed": "red"}, "observed"),
     (sighting, {"observed": "no\nname"}, "observed"),
     (sighting, {"observer_anchor": ("blue", 3)}, "observer_anchor"),
     (sighting, {"observed_anchor": ("red", 3)}, "observed_anchor"),
     (sighting, {"observed_anchor": ("grey", -3)}, "observed_anchor"),
     (sighting, {"measurement": Sighting(1e9, 0.0, None, 0.1, 0.1, None)}, "range"),
+    (sighting, {"measurement": Sighting(1.0, 0.0, 0.0, 1e155, 0.1, 0.1)}, "sigma_range"),
+    (sighting, {"measurement": Sighting(1.0, 0.0, 0.0, 0.1, 1e-155, 0.1)}, "sigma_bearing"),
+    (sighting, {"measurement": Sighting(1.0, 0.0, 0.0, 0.1, 0.1, 1e155)}, "sigma_heading"),
     (local_map, {"grid": grid((4, 4001))}, "shape"),
     (local_map, {"grid": grid((0, 4))}, "shape"),
     (local_map, {"grid": grid((4,))}, "shape"),
@@ -160,6 +164,7 @@ def test_a_covariance_is_kept_as_a_copy_nobody_can_change() -> None:
 @given(st.text(max_size=70) | st.text("ab./ \\-_", max_size=5))
 @example("a" * 64)
 @example("a" * 65)
+@example("\N{ROBOT FACE}" * 17)
 @example("ein Roboter 2")
 def test_names_are_those_of_a_session(name: str) -> None:
     def fits(check: Callable[[str], object]) -> bool:
@@ -170,3 +175,4 @@ def test_names_are_those_of_a_session(name: str) -> None:
         return True
 
     assert fits(lambda n: check_name(n, "test", "name")) == fits(session_file._file_name)
+    assert not fits(session_file._file_name) or len(name.encode()) <= 64

@@ -304,14 +304,14 @@ def hostile() -> dict[str, Record]:
 
     a, b = VertexId("r1", 1), VertexId("r1", 4)
     return {
-        "an edge of other ends than before": edge(2, 9, a, b, far, STEP),
+        "other ends than before": edge(2, 9, a, b, far, STEP),
         "an edge into another robot's map": edge(70, 0, a, VertexId("r0", 0), far, STEP),
         "an edge between two vertices of another robot": edge(70, 0, VertexId("r0", 2), VertexId("r0", 1), far, STEP),
         "a loop that is far off and sure": edge(70, 0, a, b, far, sharp),
         "a loop that says nothing": edge(70, 0, a, b, far, blunt),
         "an anchor far off and sure": AnchorRecord("r1", 0, 9, 1.0, a, UncertainPose(far, sharp)),
-        "an anchor in a robot nobody knows": AnchorRecord(
-            "r1", 0, 9, 1.0, VertexId("zed", 4), UncertainPose(far, STEP)
+        "an anchor in a vertex nobody knows": AnchorRecord(
+            "r1", 0, 9, 1.0, VertexId("r1", 4000), UncertainPose(far, STEP)
         ),
         "a sighting of a robot nobody knows": SightingRecord(
             "r1", 900, 0, 1.0, "zed", Sighting(3.0, 0.1, 0.2, 0.1, 0.1, 0.1), ("r1", 0), ("zed", 0)

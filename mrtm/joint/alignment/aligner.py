@@ -83,7 +83,7 @@ class Aligner:
         return any(a.edge and {v.robot for v in pair} == {one, other} for pair, a in self.attempts.items())
 
     def look(self, graph: JointGraph, maps: Mapping[VertexId, Surface], most: int) -> bool:
-        """Try the pairs of a component that are due, at most so many; whether any was.
+        """Try the pairs of a component that are due, at most so many; whether any was, or a believed one went.
 
         Args:
             graph: of the component; its edges are not touched.
@@ -104,7 +104,9 @@ class Aligner:
             return guesses
 
         near = pairs(closed, poses, relatives, wanted, most=looks, looks=looks)
-        for a, b in asked.keys() - {(c.a, c.b) for c in near}:
+        apart = sorted(asked.keys() - {(c.a, c.b) for c in near})
+        gone = any(pair in self.attempts and self.attempts[pair].edge for pair in apart)
+        for a, b in apart:
             self.attempts[a, b] = Attempt((closed[a], closed[b]), asked[a, b], None, None, "they hardly overlap")
         due = [c for c in near if self._due((c.a, c.b), (closed[c.a], closed[c.b]), c.guess)][:most]
         refused = (p for p, a in self.attempts.items() if not a.edge and {*p} <= closed.keys())
@@ -115,7 +117,7 @@ class Aligner:
                 due.append(Candidate(*pair, guess))
         for a, b, guess in due:
             self._try((a, b), (closed[a], closed[b]), guess)
-        return bool(due)
+        return bool(due) or gone
 
     def take_back(self, graph: JointGraph) -> list[EdgeId]:
         """Give up alignments in ``graph`` that the joint estimate contradicts; their edges are to be removed.
