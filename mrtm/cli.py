@@ -1,6 +1,10 @@
 """The command ``mrtm``: parse, call, print. Everything heavy is imported by the command that needs it."""
 
+import io
+import os
+import signal
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,7 +13,7 @@ import typer
 
 from frontend.errors import FrontendError
 from mrtm import __version__
-from mrtm.errors import MrtmError
+from mrtm.errors import MrtmError, OutputError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -24,6 +28,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _place(text: str) -> Path:
+    if not text:  # which a Path takes for the current directory: an unset variable in a script
+        raise OutputError('the place to write to is ""; give a path, or . for the current directory')
+    return Path(text)
+
 
 ConfigFile = Annotated[Path | None, typer.Option("--config", metavar="FILE", help="YAML; `mrtm config` prints one.")]
 Options = Annotated[
@@ -47,7 +58,7 @@ def _main(version: Annotated[bool, typer.Option("--version", help="Print the ver
 @app.command()
 def run(
     session: Session,
-    out: Annotated[Path, typer.Option(help="Directory for map, trajectories and graph.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", parser=_place, help="Directory for map, trajectories and graph.")],
     config: ConfigFile = None,
     options: Options = None,
     preset: Preset = None,
@@ -61,7 +72,7 @@ def run(
     from mrtm.session import run_session
 
     with showing(quiet) as progress:
-        result = run_session(session, out, parameters, progress, threads)
+        result = run_session(session, out, parameters, progress, threads, [config] if config else [])
     if not quiet:
         from mrtm.output.report import run_report
 
@@ -71,7 +82,7 @@ def run(
 @app.command()
 def compare(
     session: Session,
-    out: Annotated[Path, typer.Option(help="Directory for the table and the figures.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", parser=_place, help="Directory for the table and the figures.")],
     config: ConfigFile = None,
     options: Options = None,
     preset: Preset = None,
@@ -85,7 +96,7 @@ def compare(
     from mrtm.session import compare_session
 
     with showing(quiet) as progress:
-        scores = compare_session(session, out, parameters, progress, threads)
+        scores = compare_session(session, out, parameters, progress, threads, [config] if config else [])
     if not quiet:
         from mrtm.compare import rows, table
 
@@ -94,7 +105,7 @@ def compare(
 
 @app.command()
 def evaluate(
-    out: Annotated[Path, typer.Argument(help="What `mrtm run` left behind.")],
+    out: Annotated[Path, typer.Argument(metavar="DIR", parser=_place, help="What `mrtm run` left behind.")],
     relations: Annotated[Path | None, typer.Option(metavar="FILE", help="True relative poses.")] = None,
     truth: Annotated[Path | None, typer.Option(metavar="TUM", help="True or reference trajectory.")] = None,
     session: Annotated[
@@ -129,13 +140,19 @@ def info(log: Annotated[Path, typer.Argument(help="A robot's log of any known fo
 @app.command()
 def convert(
     log: Annotated[Path, typer.Argument(help="A robot's log of any known format.")],
-    out: Annotated[Path, typer.Argument(help="The CARMEN log; .gz, .bz2 or .xz at the end compresses it.")],
+    out: Annotated[
+        Path,
+        typer.Argument(metavar="OUT", parser=_place, help="The CARMEN log; .gz, .bz2 or .xz at the end compresses it."),
+    ],
 ) -> None:
     """Write a log as CARMEN."""
     from frontend.readers import open_log
     from frontend.writers import write_carmen
+    from mrtm.output.place import check_outputs, file_output
 
     source = open_log(log)
+    check_outputs(file_output(out), [log])
+    out.parent.mkdir(parents=True, exist_ok=True)
     typer.echo(f"{out}: {write_carmen(source.scans(), out)} scans")
     if source.report.sightings:
         typer.echo(f"left out: {source.report.sightings} sightings, which CARMEN has no message for")
@@ -196,18 +213,48 @@ def _load(file: Path | None, preset: str | None, options: Sequence[str]) -> "Con
 
 
 def main() -> None:
-    """Run the command line; an error that is the user's to mend is one line on stderr and exit code 2."""
+    """Run the command line.
+
+    An error that is the user's to mend is one line on stderr and exit code 2, where the machine fails exit code 1. To
+    be terminated is like being interrupted: what was begun is put in order, and the exit code tells.
+    """
+    signal.signal(signal.SIGTERM, _terminate)
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # they are for programmers; what a user must know is said in words
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # a screen that cannot show a robot's name still shows the rest
     try:
-        app()
+        try:
+            app()
+        finally:
+            sys.stdout.flush()
     except (MrtmError, FrontendError) as error:
-        _fail(str(error))
+        _fail(str(error), 2)
+    except UnicodeEncodeError as error:
+        _fail(f"{error.object}: not a name of a file in this locale; set LC_ALL=C.UTF-8", 1)
+    except MemoryError as error:
+        why = f" ({error})" if str(error) else ""
+        _fail(f"out of memory{why}; set fewer frontend.particles, or --threads 1 for one robot at a time", 1)
     except OSError as error:
-        if error.filename is None:
-            raise
-        _fail(f"{error.filename}: {error.strerror}")
+        if error.filename is None:  # every file has its name: it is the screen, or what has taken its place
+            _discard_output()
+        if not isinstance(error, BrokenPipeError):  # whoever read has seen enough
+            _fail(f"{error.filename or 'cannot go on'}: {error.strerror or error}", 1)
+        sys.exit(1)
 
 
-def _fail(message: str) -> None:
+def _terminate(number: int, frame: object) -> None:
+    signal.signal(number, signal.SIG_IGN)  # once is enough: what has begun to end must not be disturbed
+    sys.exit(128 + number)
+
+
+def _discard_output() -> None:
+    """So that nothing tries again, at exit, to write what could not be written."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, sys.stdout.fileno())
+
+
+def _fail(message: str, code: int) -> None:
     line = " ".join(message.split())  # a hostile file name must not break the line
     typer.secho(f"error: {line}", fg="red", err=True)
-    sys.exit(2)
+    sys.exit(code)

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from frontend.records import LaserScan
@@ -10,6 +10,7 @@ from mrtm.compare import Score, compare
 from mrtm.config import Config
 from mrtm.cores import limited_to
 from mrtm.output.export import export
+from mrtm.output.place import check_outputs, comparison_outputs, earlier_files, run_outputs
 from mrtm.progress import Progress
 from mrtm.result import RunResult
 from mrtm.team.front_ends import map_members
@@ -22,17 +23,25 @@ MAPPING = 0.95  # of a run's time
 COMPARED = 0.8  # of a comparison's time, when the session has been mapped
 
 
-def run_session(path: Path, out: Path, config: Config, progress: Progress, cores: int | None = None) -> RunResult:
+def run_session(
+    path: Path, out: Path, config: Config, progress: Progress, cores: int | None = None, kept: Sequence[Path] = ()
+) -> RunResult:
     """Map a team's session, or a single robot's log, and write what a run leaves behind.
 
     Args:
         cores: to use at most, all there are if not given; the result does not depend on it.
+        kept: files besides those of the session that must not be written over.
 
     Raises:
         SessionError: the session is not one, or a robot's window of its log holds no scan.
         LogError: a log cannot be read or holds no usable scan.
+        OutputError: ``out`` cannot be written into, or a file of the session would be written over.
+        OSError: a file cannot be written in the end.
     """
-    result = map_session(open_session(path), config, lambda done, doing: progress(MAPPING * done, doing), cores)
+    session = open_session(path)
+    outputs = run_outputs(out, [member.name for member in session.members])
+    check_outputs(outputs, (*session.files, *kept), earlier_files(out))
+    result = map_session(session, config, lambda done, doing: progress(MAPPING * done, doing), cores)
     progress(MAPPING, "writing")
     export(result, out)
     progress(1.0, f"{result.counts['scans']} scans, {result.counts['vertices']} vertices")
@@ -40,19 +49,20 @@ def run_session(path: Path, out: Path, config: Config, progress: Progress, cores
 
 
 def compare_session(
-    path: Path, out: Path, config: Config, progress: Progress, cores: int | None = None
+    path: Path, out: Path, config: Config, progress: Progress, cores: int | None = None, kept: Sequence[Path] = ()
 ) -> tuple[Score, ...]:
     """Map a session and make its joint map three ways, measured against the truth that the session names.
 
     Args:
         out: for the table and the figures, see ``mrtm.compare.compare``.
-        cores: as of ``run_session``.
+        cores, kept: as of ``run_session``.
 
     Raises:
-        SessionError, LogError: as of ``run_session``.
+        SessionError, LogError, OutputError, OSError: as of ``run_session``.
         EvaluationError: a file of the truth cannot be read.
     """
     session = open_session(path)
+    check_outputs(comparison_outputs(out, [member.name for member in session.members]), (*session.files, *kept))
     result = map_session(session, config, lambda done, doing: progress(COMPARED * done, doing), cores)
     return compare(
         result,

@@ -79,9 +79,9 @@ def compare(
     progress(0.6, "drawing")
     draw_paper_figures(result, [(way.name, way.result) for way in ways], out)
     with replacing(out / "comparison.json") as path:
-        path.write_text(to_json({"ways": [asdict(score) for score in scores]}))
+        path.write_text(to_json({"ways": [asdict(score) for score in scores]}), encoding="utf-8")
     with replacing(out / "comparison.md") as path:
-        path.write_text(markdown(rows(scores)))
+        path.write_text(markdown(rows(scores)), encoding="utf-8")
     progress(1.0, "compared")
     return scores
 

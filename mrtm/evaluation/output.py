@@ -1,5 +1,6 @@
 """Evaluate what a run left behind in its output directory."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,8 +17,9 @@ from mrtm.evaluation.nees import nees
 from mrtm.evaluation.relations import RelationErrors, evaluate_relations, read_relations
 from mrtm.evaluation.run_file import RunFile, read_run
 from mrtm.evaluation.statistics import Statistics
-from mrtm.evaluation.trajectory import TimedPoses, interpolate, read_tum
+from mrtm.evaluation.trajectory import TimedPoses, interpolate, no_common_time, read_tum
 from mrtm.output.files import replacing, to_json
+from mrtm.output.place import check_outputs
 
 _Name = tuple[str, int]
 
@@ -62,15 +64,27 @@ def evaluate_output(
         truth: TUM files by robot; a single file will do for a run of one robot.
 
     Raises:
-        EvaluationError: a file is missing or malformed, or ``truth`` names no robot of the run.
+        EvaluationError: a file is missing or malformed, or ``truth`` names no robot of the run, or one file has
+            no time in common with it.
+        OutputError: ``out`` cannot be written into, or what is measured against would be written over.
+        OSError: the file cannot be written in the end.
     """
     run = read_run(out)
+    given = [*((relations,) if relations else ()), *((truth,) if isinstance(truth, Path) else (truth or {}).values())]
+    check_outputs([(out, re.compile(r"evaluation\.json"))], given)
     components = {robot: entry["component"] for robot, entry in run["robots"].items()}
     trajectories = {robot: read_tum(out / "trajectory" / f"{robot}.tum") for robot in components}
     everywhere, across = (None, None)
     if relations is not None:
-        everywhere, across = evaluate_relations(read_relations(relations), trajectories, components)
-    references = {robot: read_tum(path) for robot, path in _by_robot(truth, list(components)).items()}
+        true = read_relations(relations)
+        everywhere, across = evaluate_relations(true, trajectories, components)
+        if everywhere.no_scan == len(true.times):
+            raise no_common_time(relations, true.times, trajectories.values())
+    references = {}
+    for robot, path in _by_robot(truth, list(components)).items():
+        references[robot] = read_tum(path)
+        if not interpolate(trajectories[robot], references[robot].times)[1].any():
+            raise no_common_time(path, references[robot].times, [trajectories[robot]])
     measured = sorted({components[robot] for robot in references})
     frames = _true_frames(run, references)
     evaluation = Evaluation(
@@ -84,8 +98,8 @@ def evaluate_output(
         edges=_edge_honesty(run, frames) if references else None,
         meetings=evaluate_meetings(run["team"]) if "team" in run else None,
     )
-    with replacing(out / "evaluation.json") as path:
-        path.write_text(to_json(asdict(evaluation)))
+    with replacing(out / "evaluation.json") as temporary:
+        temporary.write_text(to_json(asdict(evaluation)), encoding="utf-8")
     return evaluation
 
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from frontend import se2
 from frontend.records import FloatArray
+from mrtm.evaluation.errors import EvaluationError
 from mrtm.evaluation.statistics import Statistics
 from mrtm.evaluation.trajectory import MAX_GAP, TimedPoses, interpolate, read_rows
 
@@ -47,9 +48,11 @@ def read_relations(path: Path) -> Relations:
     """Read a file of lines ``t1 t2 x y z roll pitch yaw``; ``z``, ``roll`` and ``pitch`` are not used.
 
     Raises:
-        EvaluationError: the file or a line of it cannot be read.
+        EvaluationError: the file or a line of it cannot be read, or it holds a trajectory.
     """
     rows = read_rows(path, "t1 t2 x y z roll pitch yaw")
+    if len(rows) > 1 and np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1.0).max() < 1e-3:
+        raise EvaluationError(f"{path}: no relations: quaternions, as in a TUM trajectory; give it as --truth")
     return Relations(rows[:, :2], np.column_stack([rows[:, 2:4], se2.wrap(rows[:, 7])]))
 
 

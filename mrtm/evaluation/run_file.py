@@ -58,6 +58,12 @@ class EdgeEntry(TypedDict):
     covariance: NotRequired[_Covariance]
 
 
+def _both_or_neither(edge: EdgeEntry) -> EdgeEntry:
+    if ("measurement" in edge) != ("covariance" in edge):
+        raise ValueError("a measurement and a covariance belong together")
+    return edge
+
+
 class MeetingEntry(TypedDict):
     time: _Number
     robots: tuple[_Robot, _Robot]
@@ -78,7 +84,7 @@ class RunFile(TypedDict):
     robots: Annotated[dict[_Robot, RobotEntry], Field(min_length=1)]
     components: list[Annotated[list[_Name], Field(min_length=1)]]
     vertices: list[VertexEntry]
-    edges: list[EdgeEntry]
+    edges: list[Annotated[EdgeEntry, AfterValidator(_both_or_neither)]]
     team: NotRequired[TeamEntry]
 
 

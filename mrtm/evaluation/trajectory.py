@@ -1,6 +1,7 @@
 """Trajectories as the evaluation needs them: read from a file, asked for the pose at a time."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy.typing as npt
 from frontend import se2
 from frontend.records import FloatArray
 from mrtm.evaluation.errors import EvaluationError
+from mrtm.team.checks import FARTHEST, LATEST
 
 MAX_GAP = 0.3
 """Seconds: a pose is interpolated only between scans this close to the time asked for (Kuemmerle et al. 2009)."""
@@ -30,9 +32,11 @@ def read_tum(path: Path) -> TimedPoses:
     """Read planar poses from a TUM file, lines ``t x y z qx qy qz qw``, ``#`` starting a comment.
 
     Raises:
-        EvaluationError: the file or a line of it cannot be read.
+        EvaluationError: the file or a line of it cannot be read, or it holds relations.
     """
     rows = read_rows(path, "t x y z qx qy qz qw")
+    if not rows[:, 4:7].any() and np.ptp(np.abs(rows[:, 7])) > 0.01:  # a relation's angle stands where qw would
+        raise EvaluationError(f"{path}: no trajectory: turns about nothing, as in a file of relations; give it as such")
     largest = np.abs(rows[:, 4:]).max(axis=1)
     if not np.all(largest > 0):
         raise EvaluationError(f"{path}: pose {int(np.argmin(largest)) + 1} has a quaternion of length zero")
@@ -45,12 +49,13 @@ def read_rows(path: Path, columns: str) -> FloatArray:
     """Read a text table of the named columns, (n, len(columns)); blank lines and ``#`` comments are skipped.
 
     Raises:
-        EvaluationError: the file cannot be read, holds nothing, or a line is not that many finite numbers.
+        EvaluationError: the file cannot be read, holds nothing, or a line is not that many numbers within bounds.
     """
-    width = len(columns.split())
+    names = columns.split()
+    width = len(names)
     rows: list[list[float]] = []
     try:
-        text = path.read_text()
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
         raise EvaluationError(f"{path}: cannot be read ({reason})") from error
@@ -65,10 +70,21 @@ def read_rows(path: Path, columns: str) -> FloatArray:
         if len(row) != width or not all(map(math.isfinite, row)):
             found = line.strip()[:80]
             raise EvaluationError(f"{path}:{number}: expected the {width} numbers `{columns}`, found {found!r}")
+        for name, value in zip(names, row, strict=True):
+            limit = LATEST if name.startswith("t") else FARTHEST
+            if abs(value) > limit:
+                raise EvaluationError(f"{path}:{number}: {name} is {value:g}; must be within plus and minus {limit:g}")
         rows.append(row)
     if not rows:
         raise EvaluationError(f"{path}: no line `{columns}` in it")
     return np.array(rows)
+
+
+def no_common_time(path: Path, times: FloatArray, runs: Iterable[TimedPoses]) -> EvaluationError:
+    """The error of a file none of whose ``times`` is one of the run's scans."""
+    known = np.concatenate([run.times for run in runs])
+    theirs, ours = (f"{t.min():.1f} to {t.max():.1f} s" for t in (times, known))
+    return EvaluationError(f"{path}: not of this run: no scan at its times, {theirs}; those of the run are {ours}")
 
 
 def interpolate(

@@ -20,6 +20,7 @@ from mrtm.output.files import replacing, to_json
 from mrtm.output.g2o import write_g2o
 from mrtm.output.local_maps import local_map_name, write_local_map
 from mrtm.output.occupancy import write_occupancy
+from mrtm.output.place import remove_earlier
 from mrtm.result import RunResult, Trajectory
 
 MAP_RESOLUTION = 0.05
@@ -29,44 +30,44 @@ MAP_RESOLUTION = 0.05
 def export(result: RunResult, out: Path) -> None:
     """Write ``result`` to the directory ``out`` as the design's "What a run leaves behind" has it.
 
-    Every file appears whole or not at all, ``run.json`` last; what an earlier run left and this one has no use for is
-    removed. The same result gives the same bytes, except for ``timings``, ``longest`` and
-    ``latencies`` in ``run.json``; the seconds spent here are entered among the first as ``output``.
+    What an earlier run wrote is removed first, as far as its ``run.json`` lists it. Then every file appears whole or
+    not at all, ``run.json`` last: without one the directory is unfinished. The same result gives the same bytes, except
+    for ``timings``, ``longest`` and ``latencies`` in ``run.json``; the seconds spent here are entered among the first
+    as ``output``.
+
+    Raises:
+        OSError: a file cannot be written.
     """
     started = time.perf_counter()
+    remove_earlier(out)
     for directory in (out, out / "trajectory", out / "local_maps"):
         directory.mkdir(parents=True, exist_ok=True)
     components = by_size(result.components)
-    written: set[Path] = set()
+    written = [out / "graph.g2o"]
     with ThreadPoolExecutor(1) as background:  # compression lets go of the interpreter lock
         pending = []
         for vertex, local_map in result.local_maps.items():
             path = out / "local_maps" / local_map_name(vertex)
-            written.add(path)
+            written.append(path)
             pending.append(background.submit(write_local_map, path, local_map))
         for robot, trajectory in result.trajectories.items():
             path = out / "trajectory" / f"{robot}.tum"
-            written.add(path)
+            written.append(path)
             _write_tum(path, trajectory)
         write_g2o(out / "graph.g2o", result, components)
         for number, component in enumerate(components):
             stem = out / map_stem(number)
-            written |= {stem.with_suffix(suffix) for suffix in (".pgm", ".yaml", ".png")}
+            written += [stem.with_suffix(suffix) for suffix in (".pgm", ".yaml", ".png")]
             write_occupancy(stem, fuse(result.placed_maps(component), MAP_RESOLUTION))
             draw_map(result, component, stem.with_suffix(".png"))
         for job in pending:
             job.result()
-    stale = [path for pattern in _PATTERNS for path in out.glob(pattern) if path not in written]
-    for path in (*stale, out / "evaluation.json"):
-        path.unlink(missing_ok=True)
     result.timings["output"] = time.perf_counter() - started
     if "total" in result.timings:
         result.timings["total"] += result.timings["output"]
+    record = run_record(result) | {"files": sorted(path.relative_to(out).as_posix() for path in written)}
     with replacing(out / "run.json") as temporary:
-        temporary.write_text(to_json(run_record(result)))
-
-
-_PATTERNS = ("trajectory/*.tum", "local_maps/*.npz", "map.*", "map-*.pgm", "map-*.yaml", "map-*.png")
+        temporary.write_text(to_json(record), encoding="utf-8")
 
 
 def map_stem(component: int) -> str:
@@ -145,4 +146,5 @@ def _write_tum(path: Path, trajectory: Trajectory) -> None:
     columns = [trajectory.times, trajectory.poses[:, :2], zeros, zeros, zeros, np.sin(half), np.cos(half)]
     line = "%.6f %.9f %.9f %d %d %d %.12f %.12f"
     with replacing(path) as temporary:
-        temporary.write_text("".join(line % tuple(row) + "\n" for row in np.column_stack(columns).tolist()))
+        text = "".join(line % tuple(row) + "\n" for row in np.column_stack(columns).tolist())
+        temporary.write_text(text, encoding="utf-8")

@@ -1,5 +1,6 @@
 """Files appear whole or not at all."""
 
+import errno
 import json
 import math
 import os
@@ -13,11 +14,20 @@ import numpy as np
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside ``path`` to write to; on success it takes its place, on an error it is removed."""
+    """Give a temporary path beside ``path`` to write to; on success it takes its place, on an error it is removed.
+
+    Raises:
+        OSError: as the block does, or for want of memory; its file is always ``path``: of a full disk the system tells
+            no name.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         yield temporary
         temporary.replace(path)
+    except OSError as error:
+        raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
+    except MemoryError as error:
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM), str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

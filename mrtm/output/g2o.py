@@ -37,4 +37,4 @@ def write_g2o(path: Path, result: RunResult, components: list[list[VertexId]]) -
     # Last: GTSAM stops reading edges at a line it does not know.
     lines += [f"FIX {number[component[0]]}" for component in components if component]
     with replacing(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n")
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -34,5 +34,6 @@ def write_occupancy(stem: Path, grid: Grid) -> None:
             f"origin: [{x:.6f}, {y:.6f}, 0.000000]\n"
             f"negate: 0\n"
             f"occupied_thresh: 0.65\n"
-            f"free_thresh: 0.196\n"
+            f"free_thresh: 0.196\n",
+            encoding="utf-8",
         )

@@ -1,5 +1,6 @@
 """What a run and its evaluation have to say, for the terminal."""
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 
@@ -9,13 +10,18 @@ from rich.markup import escape
 from rich.table import Table
 
 from mrtm.evaluation import AbsoluteErrors, Evaluation, Meetings, RelationErrors, Statistics
-from mrtm.result import Latency, RunResult
+from mrtm.result import Latency, RunResult, SightingFate, TeamStory
 
 FATES = ("accepted", "replaced", "refused")
+VERDICTS = ("accepted", "waiting", "refused")
+
+MOST_PAIRS = 15
+"""Of robots on the screen."""
 
 
 def run_report(result: RunResult) -> list[RenderableType]:
-    """Scans and speed, components, edges by type and fate, timings by stage, latencies, blemishes of the logs.
+    """Scans and speed, components, what became of the sightings, edges by type and fate, timings by stage, latencies,
+    blemishes of the logs.
 
     ``timings["total"]``, if there, is the whole run; else the stages are added up.
     """
@@ -25,6 +31,8 @@ def run_report(result: RunResult) -> list[RenderableType]:
         parts.append(f"[bold]{len(component)}[/] vertices in one map: {escape(robots)}")
     if len(result.components) > 1:
         parts.append(f"[yellow]{len(result.components)} maps: these robots never came into one[/]")
+    if result.team is not None:
+        parts += _pairs(result.team)
     if result.edges:
         parts.append(_edges(result))
     if result.timings:
@@ -85,6 +93,35 @@ def _edges(result: RunResult) -> Table:
     for kind in dict.fromkeys(kind for kind, _ in counts):
         table.add_row(kind.replace("_", " "), *(str(counts[kind, fate] or "") for fate in FATES))
     return table
+
+
+def _pairs(team: TeamStory) -> list[RenderableType]:
+    """For every two robots what became of the sightings between them, and why; first those with least believed."""
+    if not team.sightings:
+        return ["[yellow]nobody saw another: there is no sighting in the session[/]"]
+    pairs: dict[tuple[str, str], list[SightingFate]] = {}
+    for sighting in team.sightings:
+        one, other = sorted((sighting.observer, sighting.observed))
+        pairs.setdefault((one, other), []).append(sighting)
+    table = Table("sightings between")
+    for verdict in VERDICTS:
+        table.add_column(verdict, justify="right")
+    table.add_column("mostly because")
+    fates = {pair: Counter(s.fate for s in sightings) for pair, sightings in pairs.items()}
+    order = sorted(pairs, key=lambda pair: (fates[pair]["accepted"] / fates[pair].total(), pair))
+    for pair in order[:MOST_PAIRS]:
+        names = " and ".join(pair)
+        counts = (str(fates[pair][verdict] or "") for verdict in VERDICTS)
+        table.add_row(escape(names), *counts, escape(_common_reason(pairs[pair]).replace(f" of {names}", "")))
+    rest = len(order) - MOST_PAIRS
+    return [table, f"and {rest} more pairs: team.sightings in run.json"] if rest > 0 else [table]
+
+
+def _common_reason(sightings: Sequence[SightingFate]) -> str:
+    """The most common of the reasons, numbers aside, for what is not accepted if there is such."""
+    reasons = [s.reason for s in sightings if s.fate != "accepted"] or [s.reason for s in sightings]
+    kinds = [re.sub(r"[0-9.]+", "", reason) for reason in reasons]
+    return reasons[kinds.index(Counter(kinds).most_common(1)[0][0])]
 
 
 def _timings(result: RunResult) -> Table:

@@ -2,8 +2,13 @@
 
 import multiprocessing
 import os
-from collections.abc import Sequence
+import signal
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import forkserver, resource_tracker
+from multiprocessing.context import ForkServerContext
 from multiprocessing.sharedctypes import SynchronizedArray
 
 from frontend.rbpf import first_run
@@ -26,6 +31,7 @@ def map_members(session: TeamSession, config: Config, cores: int, progress: Prog
     Raises:
         LogError: a log cannot be read or holds no usable scan.
         SessionError: a robot's window of its log holds no scan.
+        MemoryError: the system killed a process.
     """
     jobs = [
         MappingJob(n, m, config, tuple(sighting_times(session.sightings, m.name)))
@@ -48,9 +54,11 @@ def _at_once(jobs: int, cores: int) -> int:
 def _map_side_by_side(jobs: Sequence[MappingJob], at_once: int, cores: int, progress: Progress) -> list[MemberRun]:
     # Forked from a process that has imported all and started nothing: numba's threads do not survive a fork.
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([map_in_process.__module__])
+    context.set_forkserver_preload([map_in_process.__module__, "mrtm.team.half_begun"])
+    _start_server(context)
     done: SynchronizedArray[float] = context.Array("d", len(jobs))
-    with ProcessPoolExecutor(at_once, context, start_process, (done, cores, at_once)) as pool:
+    lifeline, held = context.Pipe(duplex=False)
+    with ProcessPoolExecutor(at_once, context, start_process, (done, lifeline, cores, at_once)) as pool, held:
         results = [pool.submit(map_in_process, job) for job in jobs]
         busy = set(results)
         while busy:
@@ -58,5 +66,32 @@ def _map_side_by_side(jobs: Sequence[MappingJob], at_once: int, cores: int, prog
             progress(sum(done[:]) / len(jobs), f"{len(ready)} of {len(jobs)} robots mapped")
             if any(result.exception() for result in ready):
                 break
-        pool.shutdown(wait=False, cancel_futures=True)
-        return [result.result() for result in results if result.done()]
+        pool.shutdown(wait=not busy, cancel_futures=True)
+        try:
+            return [result.result() for result in results if result.done()]
+        except BrokenProcessPool as error:
+            raise MemoryError("the system killed a process that maps a robot") from error
+
+
+def _start_server(context: ForkServerContext) -> None:
+    """Start the process that the others are forked from, and wait until it has imported all.
+
+    It and the others stay deaf: what is to end all is for this process, on whose lifeline they are. Interrupted while
+    they import, they would each print where they were.
+    """
+    resource_tracker.ensure_running()  # else the server starts it, and hears again
+    with _deaf():
+        forkserver.ensure_running()
+    first = context.Process()  # which does nothing
+    first.start()
+    first.join()
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Let the interrupt key and the request to end wait until after the block; who is started in it hears neither."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

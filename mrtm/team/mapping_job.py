@@ -4,9 +4,14 @@ Imports next to nothing: every process waits for it.
 """
 
 import os
+import sys
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from multiprocessing import util
+from multiprocessing.connection import Connection
 from multiprocessing.sharedctypes import SynchronizedArray
+from threading import Thread
 
 from frontend.ahead import ahead
 from frontend.readers import open_log
@@ -53,19 +58,31 @@ def map_robot(job: MappingJob, report: Callable[[float, int, int], None]) -> Mem
 _done: "SynchronizedArray[float]"
 
 
-def start_process(done: "SynchronizedArray[float]", cores: int, processes: int) -> None:
+def start_process(done: "SynchronizedArray[float]", lifeline: Connection, cores: int, processes: int) -> None:
     """Make a process ready for ``map_in_process``.
 
     Args:
         done: for every job which fraction of it is done.
+        lifeline: the process ends when the other end of it is closed, however that came to be: by the process that
+            waits for the map, or by the system if that one is no more.
         cores: that all processes together may use.
         processes: how many there are.
     """
     global _done
     _done = done
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # as of the command
     use_cores(max(cores // processes, 1))
     if hasattr(os, "sched_setaffinity"):  # for where there are more processes than cores
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+    Thread(target=_live_by, args=(lifeline,), name="lifeline", daemon=True).start()
+
+
+def _live_by(lifeline: Connection) -> None:
+    lifeline.poll(None)
+    # numba has made itself a semaphore with the first word of cores, and what stays behind is complained of.
+    util._exit_function()  # type: ignore[attr-defined]
+    os._exit(1)
 
 
 def map_in_process(job: MappingJob) -> MemberRun:

@@ -22,14 +22,13 @@ from frontend.errors import FrontendError
 from frontend.readers import open_log
 from mrtm.errors import ConfigError
 from mrtm.plain_yaml import read_yaml, shorten
+from mrtm.team.checks import NAME, fit_name, is_name
 from mrtm.team.errors import SessionError
 from mrtm.team.sightings_file import TimedSighting, read_sightings
 
 __all__ = ["Member", "SessionError", "TeamSession", "TimedSighting", "open_session", "read_session"]
 
-LONGEST_NAME = 64
 LONGEST_PATH = 400
-_FORBIDDEN = set('/\\:*?"<>|')
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +59,7 @@ class TeamSession:
         sightings: by team time.
         relations: file of true relative poses, in the logs' own time.
         truth: TUM files by robot.
+        files: all that it is made of, itself first.
     """
 
     name: str
@@ -67,6 +67,7 @@ class TeamSession:
     sightings: tuple[TimedSighting, ...]
     relations: Path | None
     truth: dict[str, Path]
+    files: tuple[Path, ...]
 
 
 def open_session(path: Path) -> TeamSession:
@@ -80,7 +81,7 @@ def open_session(path: Path) -> TeamSession:
     """
     if not _is_session(path):
         name = _stem(path)
-        return TeamSession(name, (Member(name, path, 0.0, math.inf, 0.0),), (), None, {})
+        return TeamSession(name, (Member(name, path, 0.0, math.inf, 0.0),), (), None, {}, (path,))
     session = read_session(path)
     for member in session.members:
         try:
@@ -108,6 +109,8 @@ def read_session(path: Path) -> TeamSession:
     except ValidationError as error:
         raise SessionError(f"{path}: {_complaint(error)}") from None
     place = path.parent
+    logs = [member.log for member in given.robots.values()]
+    others = [given.sightings, given.relations, *(given.truth or {}).values()]
     return TeamSession(
         name=_stem(path),
         members=tuple(
@@ -117,6 +120,7 @@ def read_session(path: Path) -> TeamSession:
         sightings=() if given.sightings is None else read_sightings(place / given.sightings, given.robots),
         relations=None if given.relations is None else place / given.relations,
         truth={name: place / file for name, file in (given.truth or {}).items()},
+        files=(path, *(place / file for file in (*logs, *others) if file is not None)),
     )
 
 
@@ -129,8 +133,8 @@ def _no_truth_value(value: Any) -> Any:
 def _file_name(name: Any) -> str:
     if not isinstance(name, str):  # YAML reads 1 as a number and no as false
         raise ValueError("a robot's name must be text; put it in quotes")
-    if not (0 < len(name) <= LONGEST_NAME and _fit(name) == name):
-        raise ValueError(f"a robot's name must do as a file's: at most {LONGEST_NAME} letters, digits or - _ .")
+    if not is_name(name):
+        raise ValueError(f"a robot's name must do as a file's: {NAME}")
     return name
 
 
@@ -214,10 +218,4 @@ def _is_session(path: Path) -> bool:
 
 
 def _stem(path: Path) -> str:
-    return _fit(path.name.split(".")[0]) or "robot"
-
-
-def _fit(name: str) -> str:
-    """The name as a file's on every system: what is fit for none is replaced by _."""
-    name = "".join("_" if letter in _FORBIDDEN or not letter.isprintable() else letter for letter in name)
-    return name.strip(" .")
+    return fit_name(path.name.split(".")[0]) or "robot"

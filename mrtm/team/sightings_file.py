@@ -18,6 +18,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from factors.errors import FactorError
 from factors.sighting import Sighting
 from mrtm.plain_yaml import shorten
+from mrtm.team.checks import SUREST, VAGUEST
 from mrtm.team.errors import SessionError
 
 LARGEST = 1 << 26
@@ -37,7 +38,7 @@ class TimedSighting:
 _Seconds = Annotated[float, Field(ge=0.0, lt=1e10)]  # false for NaN
 _Metres = Annotated[float, Field(gt=0.0, lt=1e4)]
 _Angle = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi)]  # degrees would mostly be beyond
-_Sigma = Annotated[float, Field(ge=1e-6, lt=1e4)]  # so that its square is a variance
+_Sigma = Annotated[float, Field(ge=SUREST, le=VAGUEST)]
 _BlankIsNone = BeforeValidator(lambda text: text.strip() or None)
 
 

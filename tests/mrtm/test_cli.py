@@ -1,8 +1,13 @@
 """The command line as a user meets it: a process, its output and its exit code."""
 
+import errno
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -18,9 +23,10 @@ DEMO = Path(__file__).parents[2] / "data" / "demo"
 HEAVY = ("numpy", "scipy", "numba", "gtsam", "matplotlib", "pydantic.main", "yaml")
 
 
-def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+def call(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "mrtm", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    environment = os.environ | environment
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, env=environment)
 
 
 def test_version() -> None:
@@ -50,6 +56,7 @@ def test_config_prints_what_config_reads(tmp_path: Path) -> None:
     assert call("config", "--config", path).stdout == done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -62,12 +69,18 @@ def test_config_prints_what_config_reads(tmp_path: Path) -> None:
         (("compare", "missing.yaml", "--out", "OUT", "--quiet"), "missing.yaml: cannot be read"),
         (("evaluate", "OUT", "--relations", "missing.relations"), "OUT"),
         (("evaluate", "OUT", "--session", "missing.yaml"), "missing.yaml: cannot be read"),
+        (("run", "EMPTY", "--out", "", "--quiet"), 'the place to write to is ""'),
+        (("run", "EMPTY", "--out", "EMPTY", "--quiet"), "empty.clf: cannot be written into (not a directory)"),
+        (("run", "EMPTY", "--out", "HERE", "--config", "HERE/map.yaml", "--quiet"), "map.yaml: is read"),
+        (("convert", str(DEMO / "red.clf.gz"), ""), 'the place to write to is ""'),
+        (("convert", str(DEMO / "red.clf.gz"), str(DEMO / "red.clf.gz")), "red.clf.gz: is read"),
     ],
 )
 def test_a_user_error_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
-    places = {"OUT": str(tmp_path / "OUT"), "EMPTY": str(tmp_path / "empty.clf")}
+    places = {"OUT": str(tmp_path / "OUT"), "EMPTY": str(tmp_path / "empty.clf"), "HERE": str(tmp_path)}
     (tmp_path / "empty.clf").touch()
-    done = call(*(places.get(argument, argument) for argument in arguments))
+    (tmp_path / "map.yaml").write_text("seed: 1")
+    done = call(*(places.get(argument, argument.replace("HERE", str(tmp_path))) for argument in arguments))
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr.count("\n") == 1
@@ -75,6 +88,38 @@ def test_a_user_error_is_one_line_and_exit_code_2(tmp_path: Path, arguments: tup
     assert said in done.stderr
 
 
+def test_where_the_machine_fails_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
+    log = tmp_path / "red.clf"
+    write_carmen(ring(), log)
+    command = [sys.executable, "-m", "mrtm", "convert", str(log), str(tmp_path / "copy.clf")]
+    limited = ["bash", "-c", 'ulimit -f 10; exec "$@"', "bash", *command]
+    done = subprocess.run(limited, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, f"error: {tmp_path / 'copy.clf'}: File too large\n")
+    with Path("/dev/full").open("w") as full:
+        for command in (["config"], ["info", str(log)]):
+            called = [sys.executable, "-m", "mrtm", *command]
+            done = subprocess.run(called, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+            assert (done.returncode, done.stderr) == (1, "error: cannot go on: No space left on device\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (MemoryError("8 GiB"), 1, "error: out of memory (8 GiB); set fewer frontend.particles, or"),
+        (OSError(errno.ENOMEM, "Cannot allocate memory"), 1, "error: cannot go on: Cannot allocate memory\n"),
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), 1, ""),
+    ],
+)
+def test_no_failure_is_a_traceback(error: Exception, code: int, said: str) -> None:
+    """As the command raises it, in a process of its own for the sake of standard output."""
+    program = f"import mrtm.cli as c; from unittest.mock import Mock; c.app = Mock(side_effect={error!r}); c.main()"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == code
+    assert done.stderr.startswith(said)
+    assert done.stderr.count("\n") == (1 if said else 0)
+
+
+@pytest.mark.slow
 def test_a_session_names_what_to_measure_against(tmp_path: Path) -> None:
     (tmp_path / "trajectory").mkdir()
     (tmp_path / "trajectory" / "robot.tum").write_bytes(TRAJECTORIES[0])
@@ -98,6 +143,7 @@ def test_a_session_names_what_to_measure_against(tmp_path: Path) -> None:
     assert "names neither" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_comparison_prints_a_table_and_leaves_figures(tmp_path: Path) -> None:
     log = ring(2)
     write_carmen(log, tmp_path / "red.clf")
@@ -117,6 +163,53 @@ def test_a_comparison_prints_a_table_and_leaves_figures(tmp_path: Path) -> None:
     assert ways["on line"]["ate"] < 0.05
     quiet = call("compare", session, "--out", tmp_path / "out", "--config", file, "--quiet")
     assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
+
+
+def children(process: int) -> list[int]:
+    found: list[int] = []
+    with suppress(OSError):  # it, or a thread of it, ended meanwhile
+        for task in Path(f"/proc/{process}/task").glob("*/children"):
+            found += map(int, task.read_text().split())
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not list(Path("/proc/self/task").glob("*/children")), reason="the system tells no children")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("working", [False, True], ids=["beginning", "working"])
+def test_to_be_stopped_is_silent_and_leaves_nobody(
+    tmp_path: Path, number: signal.Signals, code: int, working: bool
+) -> None:
+    """While the processes import, and while they map; as the interrupt key does it, the whole group."""
+    command = [sys.executable, "-m", "mrtm", "run", str(DEMO / "team.yaml"), "--out", str(tmp_path), "--quiet"]
+    started = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    late = time.monotonic() + 60.0
+    while time.monotonic() < late and started.poll() is None:
+        below = children(started.pid)
+        if len(below) >= 2 and (not working or any(len(children(child)) >= 2 for child in below)):
+            break
+        time.sleep(0.01)
+    os.killpg(started.pid, number)
+    _, said = started.communicate(timeout=60)  # whoever is left holds the pipe
+    assert (started.returncode, said) == (code, "")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_names_that_the_screen_cannot_show(tmp_path: Path) -> None:
+    write_carmen(ring(), tmp_path / "red.clf")
+    session, file = tmp_path / "team.yaml", tmp_path / "small.yaml"
+    session.write_text("robots: {\u8d64: {log: red.clf}}", encoding="utf-8")
+    file.write_text(to_yaml(small()))
+    command = ["run", session, "--config", file, "--out"]
+    done = call(*command, tmp_path / "out", PYTHONIOENCODING="ascii")
+    assert (done.returncode, done.stderr.count("\n")) == (0, 1)  # the bar, and no warning of letters a font has not
+    assert "in one map: ?\n" in done.stdout
+    assert (tmp_path / "out" / "trajectory" / "\u8d64.tum").exists()
+    old = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
+    done = call(*command, tmp_path / "again", "--quiet", **old)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "rename the robot" in done.stderr
 
 
 @pytest.mark.slow

@@ -202,6 +202,9 @@ def test_nees_of_honest_and_of_overconfident_estimates(rng: np.random.Generator)
         ("# comment\n\n1 2 0 0 0 0 0 0\n1 2 x 0 0 0 0 0\n", ":4: expected the 8 numbers"),
         ("1 2 nan 0 0 0 0 0\n", ":1:"),
         ("# nothing\n", ": no line"),
+        ("1 2 1e300 0 0 0 0 0\n", ":1: x is 1e+300; must be within plus and minus 1e+06"),
+        ("1 1e13 0 0 0 0 0 0\n", ":1: t2 is 1e+13"),
+        ("1 2 0 0 0 0 0 1\n2 3 0 0 0 0 0.6 0.8\n", ": no relations: quaternions"),
     ],
 )
 def test_a_bad_relations_file_is_one_clear_line(tmp_path: Path, text: str, where: str) -> None:
@@ -229,6 +232,30 @@ def test_tum_headings_are_read_from_quaternions(tmp_path: Path) -> None:
     poses = read_tum(path)
     np.testing.assert_allclose(poses.times, [1.5, 2.5])
     np.testing.assert_allclose(poses.poses[:, 2], [np.pi / 2, 2 * np.arctan2(-0.9044122, 0.4266598)], atol=1e-6)
+
+
+def test_relations_are_no_trajectory(tmp_path: Path) -> None:
+    path = tmp_path / "a.relations"
+    path.write_text("1.5 1 2 0 0 0 0 1\n2.5 1 2 0 0 0 0 -0.3\n")
+    with pytest.raises(EvaluationError, match=r"a\.relations: no trajectory"):
+        read_tum(path)
+    path.write_text("1.5 1 2 0 0 0 0 1\n2.5 1 2 0 0 0 0 -1\n")
+    assert len(read_tum(path).times) == 2
+
+
+def test_what_has_no_time_of_the_run_is_named_and_nothing_written(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    export(sample_run(), out)
+    (tmp_path / "a.relations").write_text("1 2 0 0 0 0 0 0.5\n")
+    with pytest.raises(
+        EvaluationError, match=r"a\.relations: not of this run: .* 1\.0 to 2\.0 s; .* 100\.0 to 901\.8 s"
+    ):
+        evaluate_output(out, tmp_path / "a.relations")
+    truth = write_truth(out, tmp_path, np.zeros(3))
+    (tmp_path / "b.tum").write_text("1 0 0 0 0 0 0 1\n")
+    with pytest.raises(EvaluationError, match=r"b\.tum: not of this run"):
+        evaluate_output(out, truth=truth | {"blue": tmp_path / "b.tum"})
+    assert not (out / "evaluation.json").exists()
 
 
 def write_truth(run_dir: Path, out: Path, frame: Array) -> dict[str, Path]:
@@ -396,6 +423,7 @@ def test_truth_must_name_robots_of_the_run(tmp_path: Path) -> None:
         (("vertices", 1, "covariance"), [[1, 0, 0], [0, 1, 0], [0, 0, 0]]),
         (("edges", 0, "covariance", 0), [1, 2]),
         (("edges", 0), None),
+        (("edges", 0), {"tail": ["a", 0], "head": ["a", 1], "kind": "loop", "fate": "", "measurement": [1, 2, 3]}),
     ],
 )
 def test_a_damaged_run_is_named(tmp_path: Path, place: tuple[str | int, ...], value: object) -> None:

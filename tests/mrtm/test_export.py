@@ -1,5 +1,6 @@
 """The files of a run, read back the way others read them."""
 
+import errno
 import io
 import json
 import math
@@ -19,6 +20,7 @@ from mrtm.output.export import export
 from mrtm.output.files import replacing, to_json
 from mrtm.output.local_maps import read_local_map
 from mrtm.output.report import run_report
+from mrtm.result import SightingFate, TeamStory
 from tests.mrtm.sample_run import inside, sample_run
 
 
@@ -159,7 +161,9 @@ def test_the_same_run_gives_the_same_bytes(out: Path, tmp_path: Path) -> None:
 def test_what_an_earlier_run_left_is_cleared_away(tmp_path: Path) -> None:
     export(sample_run(), tmp_path)
     (tmp_path / "evaluation.json").write_text("{}")
-    (tmp_path / "notes.txt").write_text("mine")
+    mine = ("map.clf", "map-notes.png", "map-7.png", "trajectory/truth.tum", "local_maps/mine.npz")
+    for name in mine:
+        (tmp_path / name).write_text("mine")
     result = sample_run()
     green = VertexId("green", 0)
     result.components.remove([green])
@@ -167,7 +171,35 @@ def test_what_an_earlier_run_left_is_cleared_away(tmp_path: Path) -> None:
     export(result, tmp_path)
     names = {path.name for path in tmp_path.rglob("*")}
     assert not names & {"map-1.pgm", "map-1.yaml", "map-1.png", "green.tum", "green-0.npz", "evaluation.json"}
-    assert {"map.pgm", "notes.txt"} <= names
+    assert "map.pgm" in names
+    assert all((tmp_path / name).read_text() == "mine" for name in mine)
+
+
+def test_only_files_of_a_run_are_removed_whatever_the_earlier_one_is_said_to_have_written(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    listed = ["../notes.txt", "trajectory/../../notes.txt", str(tmp_path / "notes.txt"), "notes.txt", 7]
+    for name in ("notes.txt", "out/notes.txt"):
+        (tmp_path / name).write_text("mine")
+    records: list[object] = [{"files": listed}, {"files": 7}, [], {}]
+    for record in records:
+        (out / "run.json").write_text(json.dumps(record))
+        export(sample_run(), out)
+        assert (tmp_path / "notes.txt").exists()
+        assert (out / "notes.txt").exists()
+
+
+def test_a_run_that_could_not_be_written_is_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export(sample_run(), tmp_path)
+    (tmp_path / "evaluation.json").write_text("{}")
+
+    def full(*arguments: object, **options: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*map\.png'"):
+        export(sample_run(), tmp_path)
+    assert not list(tmp_path.glob("*.json"))
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> None:
@@ -177,12 +209,22 @@ def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path: Path) -> Non
     def fail() -> None:
         with replacing(path) as temporary:
             temporary.write_text("half of the n")
-            raise OSError("disk full")
+            raise OSError(errno.ENOSPC, "disk full")
 
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(OSError, match="disk full") as caught:
         fail()
+    assert caught.value.filename == str(path)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_want_of_memory_names_the_file_too(tmp_path: Path) -> None:
+    def fail() -> None:
+        with replacing(tmp_path / "a.txt"):
+            raise MemoryError
+
+    with pytest.raises(OSError, match=r"memory: '.*a\.txt'"):
+        fail()
 
 
 def test_json_is_strict_and_takes_numpy() -> None:
@@ -194,6 +236,27 @@ def test_json_is_strict_and_takes_numpy() -> None:
         "d": {},
         "e": {"f": [1, {"g": None}]},
     }
+
+
+def test_the_report_tells_for_each_pair_what_became_of_its_sightings_and_why() -> None:
+    def fate(observer: str, observed: str, verdict: str, reason: str) -> SightingFate:
+        return SightingFate(1.0, observer, observed, verdict, reason)
+
+    sightings = [
+        fate("red", "green", "refused", "no scan at that time"),
+        fate("green", "red", "refused", "no scan at that time"),
+        fate("red", "green", "waiting", "1 sightings of green and red agree"),
+        fate("red", "blue", "accepted", "2 of 2 sightings of blue and red agree"),
+        fate("red", "blue", "accepted", "2 of 2 sightings of blue and red agree"),
+    ]
+    console = Console(width=120, record=True, file=io.StringIO())
+    for part in run_report(replace(sample_run(), team=TeamStory([], sightings, None, None, {}))):
+        console.print(part)
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in console.export_text().splitlines()]
+    worst = rows.index(["green and red", "", "1", "2", "no scan at that time"])
+    assert rows[worst + 1] == ["blue and red", "2", "", "", "2 of 2 sightings agree"]
+    alone = run_report(replace(sample_run(), team=TeamStory([], [], None, None, {})))
+    assert any("there is no sighting" in str(part) for part in alone)
 
 
 def test_the_report_names_speed_edges_components_and_blemishes() -> None:

@@ -84,6 +84,7 @@ def test_what_a_session_may_leave_out(place: Path) -> None:
         (),
         None,
         {},
+        (place / "team.yaml", place / "red.clf", place / "blue.clf"),
     )
 
 
@@ -103,16 +104,26 @@ def test_what_a_session_may_say(place: Path) -> None:
     assert found.sightings == (TimedSighting(94.0, "red", "blue", Sighting(5.7, 0.2, -2.1, 0.05, 0.02, 0.05)),)
     assert found.relations == place / "true.relations"
     assert found.truth == {"blue": place / "blue.tum"}
+    logs = [place / name for name in ("team.yaml", "red.clf", "blue.clf")]
+    assert found.files == (*logs, place / "seen.csv", place / "true.relations", place / "blue.tum")
 
 
 @pytest.mark.parametrize(
     ("file", "name"),
-    [("red.clf", "red"), ("my log.2004.clf.gz", "my log"), ("a:b*.clf", "a_b_"), (".clf", "robot"), ("a\nb", "a_b")],
+    [
+        ("red.clf", "red"),
+        ("my log.2004.clf.gz", "my log"),
+        ("a:b*.clf", "a_b_"),
+        (".clf", "robot"),
+        ("a\nb", "a_b"),
+        ("\N{ROBOT FACE}" * 17 + ".clf", "\N{ROBOT FACE}" * 16),
+        ("a" * 63 + " b", "a" * 63),
+    ],
 )
 def test_a_log_is_a_session_of_one_named_like_the_file(tmp_path: Path, file: str, name: str) -> None:
     path = tmp_path / file
     path.write_bytes(LOGS["CARMEN"][0])
-    assert open_session(path) == TeamSession(name, (Member(name, path, 0.0, math.inf, 0.0),), (), None, {})
+    assert open_session(path) == TeamSession(name, (Member(name, path, 0.0, math.inf, 0.0),), (), None, {}, (path,))
 
 
 def test_a_session_is_known_by_its_content_too(place: Path) -> None:
