@@ -101,6 +101,7 @@ def test_one_sighting_with_a_heading_is_the_composition(rng: np.random.Generator
     np.testing.assert_allclose(found.covariance, expected, rtol=1e-6, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "both_ways", "heading"),
     [(1, False, True), (5, True, True), (2, True, False), (6, False, False), (10, True, False)],

@@ -116,6 +116,7 @@ def test_residual_derivative_is_the_numerical_one(rng: np.random.Generator, head
         np.testing.assert_allclose(by, numerical, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heading", [None, -2.2])
 def test_covariance_is_that_of_the_noise(rng: np.random.Generator, heading: float | None) -> None:
     """Noisy sensor and noisy anchors, 20000 times: the residual at the truth has the stated covariance.

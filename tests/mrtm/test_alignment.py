@@ -226,6 +226,7 @@ assert all(kernel.signatures for kernel in kernels), [kernel for kernel in kerne
 """
 
 
+@pytest.mark.slow
 def test_after_warming_up_all_kernels_are_there() -> None:
     """In a process of their own: other tests have them read."""
     subprocess.run([sys.executable, "-c", KERNELS_OF_ALIGNMENT], check=True)

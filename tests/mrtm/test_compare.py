@@ -98,6 +98,7 @@ def test_em_mends_what_the_tree_gets_wrong(result: RunResult) -> None:
     assert "42 s" in on_line.available
 
 
+@pytest.mark.slow
 def test_compare_scores_and_draws(result: RunResult, relations: Path, tmp_path: Path) -> None:
     truth = tmp_path / "red.tum"
     times, poses = _trajectory(result, "red")

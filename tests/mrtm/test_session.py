@@ -169,6 +169,7 @@ def test_the_demo_team_is_mapped_well_with_every_seed(tmp_path: Path, seed: int)
     assert ate.translation.rmse < 0.1
 
 
+@pytest.mark.slow
 def test_the_same_seed_leaves_the_same_bytes_with_any_number_of_threads(write: Write, tmp_path: Path) -> None:
     path = write(ring(2))
     outputs = []
@@ -289,6 +290,7 @@ SCANNERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCANNERS)
 def test_every_scanner_maps_the_room(name: str, write: Write, tmp_path: Path) -> None:
     """From disk, so that what the log says of the scanner is used."""

@@ -54,6 +54,7 @@ def test_a_window_without_a_scan_is_named(tmp_path: Path) -> None:
         assert str(caught.value) == f"{log}: {window}: its scans last 5.2 s; change from and to"
 
 
+@pytest.mark.slow
 def test_intel_is_cut_into_three_whole_robots(data: Path) -> None:
     """The clock of this log steps back 631 times."""
     members = open_session(data / "intel-3robots.yaml").members

@@ -189,6 +189,7 @@ def test_a_process_is_measured_by_itself(tmp_path: Path) -> None:
     assert cost.wall > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "limit", "complaint"),
     [
@@ -332,6 +333,7 @@ def test_logs_are_found_with_their_truth(tmp_path: Path) -> None:
 # Profile and day
 
 
+@pytest.mark.slow
 def test_beam_evaluations_are_counted() -> None:
     scan = next(simulate(hall(), "tour", seed=1).scans())
     points = points_of(scan, 20.0, 181)

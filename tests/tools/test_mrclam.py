@@ -109,6 +109,7 @@ def test_refuses_what_is_no_data_set(tmp_path: Path) -> None:
     assert "Robot1_Groundtruth.dat" in result.stderr
 
 
+@pytest.mark.slow
 def test_odometry_is_the_arc_and_its_covariance_that_of_the_noise() -> None:
     rng = np.random.default_rng(1)
     given = commands(rng, 20.0)
@@ -156,6 +157,7 @@ def test_sightings_thin_out_by_pair() -> None:
     assert [(s.time, s.observer, s.observed) for s in seen] == [(0.0, 1, 2), (0.0, 2, 3), (0.6, 1, 3), (1.1, 1, 2)]
 
 
+@pytest.mark.slow
 def test_simulated_team_finds_itself(dataset: Path) -> None:
     """With every tenth barcode misread the robots come into one frame, and err half as much as by odometry."""
     logs = read_dataset(dataset)

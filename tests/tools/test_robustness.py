@@ -21,6 +21,7 @@ def check(problem: Problem, outcome: Outcome, least: float = 0.97) -> None:
     assert len(outcome.believed) >= least * sum(claim.true for claim in problem.claims)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", SHARES)
 @pytest.mark.parametrize("kinds", [*((kind,) for kind in KINDS), KINDS], ids=[*KINDS, "all"])
 def test_random_false_edges(kinds: tuple[EdgeKind, ...], share: float) -> None:
@@ -45,6 +46,7 @@ def test_identical_rooms() -> None:
     check(problem, feed(problem))
 
 
+@pytest.mark.slow
 def test_the_public_set_with_250_false_closures(data: Path) -> None:
     if not (data / FOLDER).is_dir():
         pytest.skip(f"no {data / FOLDER}")

@@ -159,6 +159,7 @@ def test_drive_keeps_its_limits_and_passes_its_waypoints() -> None:
     assert np.hypot(*(log.poses[:, :2] - (15, 3)).T).min() == pytest.approx(0.6 * (np.sqrt(2) - 1), abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("building", BUILDINGS)
 @pytest.mark.parametrize("seed", range(4))
 def test_every_route_of_every_building_can_be_driven(building: str, seed: int) -> None:
@@ -243,6 +244,7 @@ def test_another_laser_or_noise_sees_the_same_drive() -> None:
     assert equal(log, simulate(SQUARE, "u", noise=PERFECT, seed=2), "times", "poses", "ranges")
 
 
+@pytest.mark.slow
 def test_pieces_of_a_long_drive_write_the_same_bytes_as_the_whole(tmp_path: Path) -> None:
     plan = BUILDINGS["cluttered"](0)
     parts = list(stream(plan, "tour", seed=1, laps=4))
@@ -262,6 +264,7 @@ def test_laps_and_hours_repeat_the_route() -> None:
     assert np.count_nonzero(np.diff(passes.astype(int)) == 1) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("laser", "message"),
     [
