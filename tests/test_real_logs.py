@@ -13,7 +13,8 @@ from mrtm.config import load_config
 from mrtm.evaluation import TimedPoses, evaluate_ate, evaluate_relations, read_relations, read_tum
 from mrtm.joint.doubts import GATE
 from mrtm.result import RunResult
-from mrtm.session import map_scans
+from mrtm.session import map_scans, map_session
+from mrtm.team.session_file import open_session
 
 pytestmark = pytest.mark.slow
 
@@ -57,6 +58,26 @@ def test_relations(data: Path, name: str, scans: int, metres: float, degrees: fl
     assert errors.translation.max < worst
     assert errors.rotation.max < 10.0
     check_loops(result)
+
+
+@pytest.mark.parametrize(
+    ("name", "crossing", "bounds"),
+    [("intel-3robots", 826, (0.022, 0.5, 0.025, 0.6)), ("aces-2robots", 45, (0.042, 0.6, 0.075, 1.0))],
+)
+def test_team(data: Path, name: str, crossing: int, bounds: tuple[float, float, float, float]) -> None:
+    """Robots that did not know where the others started: no worse between them than within the map of one."""
+    session = open_session(data / f"{name}.yaml")
+    result = map_session(session, load_config(), lambda done, doing: None)
+    assert len(result.components) == 1
+    assert session.relations is not None
+    errors, between = evaluate_relations(
+        read_relations(session.relations),
+        {robot: TimedPoses(t.times, t.poses) for robot, t in result.trajectories.items()},
+    )
+    assert between is not None
+    assert between.count == crossing
+    found = errors.translation.mean, errors.rotation.mean, between.translation.mean, between.rotation.mean
+    assert np.all(np.array(found) <= bounds), found
 
 
 def test_csail(data: Path) -> None:

@@ -2,14 +2,14 @@
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
-from mrtm.evaluation import AbsoluteErrors, Evaluation, Meetings, RelationErrors, Statistics
+from mrtm.evaluation import AbsoluteErrors, Evaluation, Meetings, RelationErrors
 from mrtm.result import Latency, RunResult, SightingFate, TeamStory
 
 FATES = ("accepted", "replaced", "refused")
@@ -47,16 +47,12 @@ def evaluation_report(evaluation: Evaluation) -> list[RenderableType]:
     """A table for each thing measured."""
     parts: list[RenderableType] = []
     if evaluation.relations is not None:
-        table = _errors_table("relations")
-        _add_relations(table, "all", evaluation.relations)
+        measured = {"all": evaluation.relations}
         if evaluation.relations_across is not None:
-            _add_relations(table, "between robots", evaluation.relations_across)
-        parts.append(table)
+            measured["between robots"] = evaluation.relations_across
+        parts += _errors("relations", measured)
     if evaluation.ate:
-        table = _errors_table("trajectory after one alignment")
-        for ate in evaluation.ate:
-            _add_ate(table, ate)
-        parts.append(table)
+        parts += _errors("trajectory (ATE)", {", ".join(ate.robots): ate for ate in evaluation.ate})
     honest = {f"{kind} edges": honesty for kind, honesty in (evaluation.edges or {}).items()}
     if evaluation.vertices is not None:
         honest["joint vertex poses"] = evaluation.vertices
@@ -149,23 +145,21 @@ def latency_table(latencies: Sequence[Latency]) -> Table:
     return table
 
 
-def _errors_table(title: str) -> Table:
+def _errors(title: str, measured: Mapping[str, RelationErrors | AbsoluteErrors]) -> list[RenderableType]:
+    """A table, two rows for each thing measured, and what could not be."""
     table = Table(title, "")
-    for column in ("mean", "std", "median", "rmse", "max", "count", "left out"):
+    for column in ("mean", "std", "median", "rmse", "max", "count"):
         table.add_column(column, justify="right")
-    return table
-
-
-def _add_relations(table: Table, name: str, errors: RelationErrors) -> None:
-    left_out = f"{errors.no_scan} no scan" if errors.no_scan else "0"
-    if errors.unconnected:
-        left_out += f", {errors.unconnected} unconnected"
-    _add_rows(table, name, errors.translation, errors.rotation, errors.count, left_out)
-
-
-def _add_ate(table: Table, errors: AbsoluteErrors) -> None:
-    left_out = f"{errors.no_scan} no scan" if errors.no_scan else "0"
-    _add_rows(table, ", ".join(errors.robots), errors.translation, errors.rotation, errors.count, left_out)
+    missing = []
+    for name, errors in measured.items():
+        for label, unit, digits, s in ((name, "m", 4, errors.translation), ("", "deg", 3, errors.rotation)):
+            numbers = [f"{value:.{digits}f}" for value in (s.mean, s.std, s.median, s.rmse, s.max)]
+            table.add_row(escape(label), unit, *numbers, str(errors.count) if label else "")
+        if errors.no_scan:
+            missing.append(f"{escape(name)}: {errors.no_scan} left out, no scan at that time")
+        if isinstance(errors, RelationErrors) and errors.unconnected:
+            missing.append(f"{escape(name)}: {errors.unconnected} left out, their robots never came into one map")
+    return [table, *(f"[yellow]{line}[/]" for line in missing)]
 
 
 def _meetings(meetings: Meetings) -> list[RenderableType]:
@@ -183,9 +177,3 @@ def _meetings(meetings: Meetings) -> list[RenderableType]:
     if meetings.to_common_frame is None:
         return [met, "[yellow]no common frame[/]", table]
     return [met, f"common frame [bold]{meetings.to_common_frame:.1f} s[/] of team time after it", table]
-
-
-def _add_rows(table: Table, name: str, metres: Statistics, degrees: Statistics, count: int, left_out: str) -> None:
-    for label, unit, digits, s in ((escape(name), "m", 4, metres), ("", "deg", 3, degrees)):
-        numbers = [f"{value:.{digits}f}" for value in (s.mean, s.std, s.median, s.rmse, s.max)]
-        table.add_row(label, unit, *numbers, *((str(count), left_out) if label else ("", "")))

@@ -18,7 +18,7 @@ from mrtm.robot.poses import array_of, innovation, pose_of
 
 LEAST_OVERLAP = 10.0  # m^2 known in both maps
 LEAST_PAIRS = 150  # points of one surface: 7.5 m of wall
-MOST_RESIDUAL = 0.035  # metres, rms: points of a cell's width that do not fit are not noise
+MOST_RESIDUAL = 0.05  # metres, rms: between maps that are bent; walls at random distances have 0.087
 LEAST_HITS = 0.7  # of the surface points in space known to the other map that must lie on its surfaces
 MOST_CONFLICTS = 0.1  # of them that may lie in space it says is free: doors and people move
 MOST_RIVAL = 0.9  # of the best place's score that another may have; long walls fit fairly well at many places
